@@ -1,0 +1,440 @@
+"""Replay on the host: append-only files of records, sampled as sequences for a population.
+
+Each population member has one stream per task, a file `member_000/task_0.records` of fixed-size
+records. Record t holds image t and the action and reward that led to it; `first` marks a reset
+(zero action and reward) and `terminal` an episode that ended by falling. Records are never
+changed once written, so a run is resumed by cutting every stream back to the length its
+checkpoint names. Files are read through memory maps: the page cache holds what was read last and
+gives it back under pressure, so the process does not grow with the replay.
+
+Axis letters: P population member, K task, T steps in a phase, B batch, L sequence length,
+A action. Images are uint8 [height, width, 3] with height = width = `image_size`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from dreamer_jax.files import explained, read_json, write_json_atomically
+
+Batch = dict[str, np.ndarray]
+_HEADER = "replay.json"
+_FORMAT = 1
+
+
+def record_dtype(image_size: int, action_size: int) -> np.dtype:
+    """The layout of one record on disk: packed, little-endian."""
+    return np.dtype(
+        [
+            ("image", "u1", (image_size, image_size, 3)),
+            ("action", "<f4", (action_size,)),
+            ("reward", "<f4"),
+            ("first", "?"),
+            ("terminal", "?"),
+        ]
+    )
+
+
+def sample_indices(
+    seed: int,
+    update: int,
+    lengths: Sequence[int],
+    batch: int,
+    length: int,
+    keep: int | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the sequences of one member's batch begin: a pure function of the arguments.
+
+    Every row draws a stream uniformly among those with at least `length` records, whatever their
+    lengths, then a start uniformly among the starts that keep the sequence inside the stream.
+
+    Args:
+        seed: the member's seed, not negative.
+        update: the number of the update, not negative.
+        lengths: [K] records in each of the member's streams.
+        batch: B.
+        length: L.
+        keep: only the newest `keep` records of each stream are sampled; None for all.
+
+    Returns:
+        tasks int64 [B] and starts int64 [B], starts counted from the first record of the stream.
+
+    Raises:
+        ValueError: no stream holds L records (within `keep`).
+    """
+    if batch < 1 or length < 1:
+        raise ValueError(f"batch and length must be at least 1, got {batch} and {length}")
+    if seed < 0 or update < 0:
+        raise ValueError(f"seed and update must not be negative, got {seed} and {update}")
+    lengths = np.asarray(lengths, np.int64)
+    oldest = np.zeros_like(lengths) if keep is None else np.maximum(lengths - keep, 0)
+    starts = lengths - oldest - length + 1
+    eligible = np.flatnonzero(starts > 0)
+    if not eligible.size:
+        within = "" if keep is None else f" (of which the newest {keep} are sampled)"
+        raise ValueError(
+            f"no stream is long enough for sequences of {length} records: "
+            f"the streams hold {lengths.tolist()}{within}; collect more or shorten the sequences"
+        )
+    random = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, update])))
+    tasks = eligible[random.integers(eligible.size, size=batch)]
+    return tasks, oldest[tasks] + random.integers(starts[tasks])
+
+
+class Replay:
+    """The streams of P members and K tasks in one folder, created or opened.
+
+    `lengths` counts the committed records of every stream. A folder opened again starts with all
+    whole records that its files hold; what a killed process left half-written beyond them is
+    overwritten by the next `append`.
+
+    Args:
+        directory: the folder; made if absent.
+        members: P.
+        tasks: K.
+        image_size: height and width of the images.
+        action_size: A.
+        keep: sample only from the newest `keep` records of each stream; None for all.
+
+    Raises:
+        ValueError: the folder holds a replay of another layout, or `keep` is less than 1.
+    """
+
+    def __init__(
+        self,
+        directory: str | os.PathLike,
+        members: int,
+        tasks: int,
+        image_size: int,
+        action_size: int,
+        keep: int | None = None,
+    ):
+        layout = {
+            "members": int(members),
+            "tasks": int(tasks),
+            "image_size": int(image_size),
+            "action_size": int(action_size),
+        }
+        if min(layout.values()) < 1:
+            raise ValueError(f"sizes of a replay must be at least 1, got {layout}")
+        if keep is not None and keep < 1:
+            raise ValueError(f"keep must be at least 1 record, or None for all; got {keep}")
+        self.directory = Path(directory)
+        self.members = layout["members"]
+        self.tasks = layout["tasks"]
+        self.keep = keep
+        self.dtype = record_dtype(image_size, action_size)
+        self._open(layout)
+        self._lengths = self._stored_lengths()
+
+    def _open(self, layout: Mapping[str, int]) -> None:
+        header = self.directory / _HEADER
+        expected = {"format": _FORMAT, **layout}
+        if header.exists():
+            stored = read_json(header)
+            differences = [
+                f"{name} {stored.get(name)} (expected {value})"
+                for name, value in expected.items()
+                if stored.get(name) != value
+            ]
+            if differences:
+                raise ValueError(
+                    f"{self.directory} holds a replay with {', '.join(differences)}; "
+                    "use the settings it was made with, or another folder"
+                )
+            return
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            for member in range(self.members):
+                self.path(member, 0).parent.mkdir(exist_ok=True)
+                for task in range(self.tasks):
+                    self.path(member, task).touch()
+        except OSError as error:
+            raise explained(
+                error, f"could not make the replay folder {self.directory}", self.directory
+            ) from error
+        # Written last: a folder with a header is complete.
+        write_json_atomically(header, expected)
+
+    def path(self, member: int, task: int) -> Path:
+        """The file of one stream."""
+        return self.directory / f"member_{member:03d}" / f"task_{task}.records"
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Committed records of every stream: int64 [P, K], a copy."""
+        return self._lengths.copy()
+
+    def _streams(self) -> Iterator[tuple[int, int]]:
+        return np.ndindex(self.members, self.tasks)
+
+    def _stored_lengths(self) -> np.ndarray:
+        lengths = np.zeros((self.members, self.tasks), np.int64)
+        for stream in self._streams():
+            path = self.path(*stream)
+            try:
+                lengths[stream] = path.stat().st_size // self.dtype.itemsize
+            except FileNotFoundError:
+                raise ValueError(
+                    f"{path} is missing from the replay in {self.directory}; restore it, "
+                    "or start again in another folder"
+                ) from None
+        return lengths
+
+    def append(self, records: Mapping[str, np.ndarray]) -> None:
+        """Add a phase to every stream.
+
+        Either all streams grow by T records or, if this raises, none does.
+
+        Args:
+            records: image uint8 [P, K, T, size, size, 3], action float32 [P, K, T, A],
+                reward float32 [P, K, T], first bool [P, K, T], terminal bool [P, K, T].
+
+        Raises:
+            ValueError: a name, shape or dtype is not as above.
+            OSError: the disk is full or not writable; names the file and the free space.
+        """
+        records = self._checked(records)
+        steps = records["reward"].shape[2]
+        path = self.directory
+        try:
+            for stream in self._streams():
+                path = self.path(*stream)
+                rows = np.empty(steps, self.dtype)
+                for name in self.dtype.names:
+                    rows[name] = records[name][stream]
+                with open(path, "r+b") as file:
+                    file.seek(int(self._lengths[stream]) * self.dtype.itemsize)
+                    _write(file, rows)
+        except OSError as error:
+            self._cut()
+            raise explained(
+                error,
+                f"could not append {steps} records to {path}",
+                path,
+                "every stream still holds what was committed before: make room and resume",
+            ) from error
+        except BaseException:
+            self._cut()
+            raise
+        self._lengths += steps
+
+    def _checked(self, records: Mapping[str, np.ndarray]) -> Batch:
+        names = self.dtype.names
+        if set(records) != set(names):
+            raise ValueError(f"records have the keys {sorted(records)}, expected {sorted(names)}")
+        arrays = {name: np.asarray(records[name]) for name in names}
+        steps = arrays["reward"].shape[2] if arrays["reward"].ndim == 3 else "T"
+        for name, array in arrays.items():
+            field = self.dtype[name]
+            expected = (self.members, self.tasks, steps, *field.shape)
+            if array.shape != expected or array.dtype != field.base:
+                raise ValueError(
+                    f"records[{name!r}] is {array.dtype} {list(array.shape)}, expected "
+                    f"{field.base} {list(expected)} (members, tasks, steps, ...)"
+                )
+        return arrays
+
+    def _cut(self) -> None:
+        """Drop from the files whatever lies beyond the committed lengths."""
+        for stream in self._streams():
+            size = int(self._lengths[stream]) * self.dtype.itemsize
+            path = self.path(*stream)
+            if path.stat().st_size > size:
+                os.truncate(path, size)
+
+    def truncate(self, lengths: np.ndarray) -> None:
+        """Cut every stream back to the lengths that a checkpoint committed.
+
+        Args:
+            lengths: integers [P, K].
+
+        Raises:
+            ValueError: the shape is wrong, or a stream holds fewer records than asked for; nothing
+                is cut then.
+        """
+        lengths = np.asarray(lengths, np.int64)
+        if lengths.shape != self._lengths.shape:
+            raise ValueError(
+                f"lengths have shape {list(lengths.shape)}, expected [members, tasks] = "
+                f"{list(self._lengths.shape)}"
+            )
+        stored = self._stored_lengths()
+        for stream in self._streams():
+            if not 0 <= lengths[stream] <= stored[stream]:
+                raise ValueError(
+                    f"{self.path(*stream)} holds {stored[stream]} records, "
+                    f"{lengths[stream]} were to be kept: the file does not belong to this "
+                    "checkpoint or has lost data; resume from an older checkpoint"
+                )
+        self._lengths = lengths.copy()
+        self._cut()
+
+    def read(self, member: int, task: int, start: int, stop: int) -> Batch:
+        """A copy of the records [start, stop) of one stream, by name.
+
+        Raises:
+            ValueError: the range is not within the committed records.
+        """
+        held = int(self._lengths[member, task])
+        if not 0 <= start <= stop <= held:
+            raise ValueError(
+                f"records [{start}, {stop}) of {self.path(member, task)} were asked for, "
+                f"it holds {held}"
+            )
+        batch = self._empty((stop - start,))
+        if stop > start:
+            stream = self._map(member, task)
+            for name in batch:
+                batch[name][:] = stream[name][start:stop]
+        return batch
+
+    def sample(
+        self,
+        seeds: Sequence[int],
+        update: int,
+        batch: int,
+        length: int,
+        members: Sequence[int] | None = None,
+        lengths: np.ndarray | None = None,
+    ) -> Batch:
+        """A batch of sequences for every member.
+
+        A member's rows depend only on its own seed, the update and the lengths of its own streams
+        (see `sample_indices`). Sequences stay within a stream and may cross an episode's end.
+
+        Args:
+            seeds: [P], one for each of `members`.
+            update: number of the update.
+            batch: B.
+            length: L.
+            members: which members, in the order of the result; all by default.
+            lengths: [P, K] sample as when the streams had these lengths (at most the committed
+                ones, which are the default).
+
+        Returns:
+            image uint8 [P, B, L, size, size, 3], action float32 [P, B, L, A], reward float32,
+            first bool and terminal bool [P, B, L]. The arrays are new and never written again:
+            on the CPU, JAX may use their memory without a copy.
+
+        Raises:
+            ValueError: no stream of a member holds L records, or arguments do not fit together.
+        """
+        members = range(self.members) if members is None else list(members)
+        if len(seeds) != len(members):
+            raise ValueError(f"{len(seeds)} seeds for {len(members)} members: one each is needed")
+        lengths = self._lengths if lengths is None else np.asarray(lengths, np.int64)
+        if lengths.shape != self._lengths.shape or (lengths > self._lengths).any():
+            raise ValueError(
+                f"lengths {lengths.tolist()} are not at most the committed "
+                f"{self._lengths.tolist()}"
+            )
+        result = self._empty((len(members), batch, length))
+        for position, (member, seed) in enumerate(zip(members, seeds, strict=True)):
+            try:
+                tasks, starts = sample_indices(
+                    int(seed), update, lengths[member], batch, length, self.keep
+                )
+            except ValueError as error:
+                raise ValueError(f"member {member} of {self.directory}: {error}") from None
+            for task in np.unique(tasks):
+                stream = self._map(member, task)
+                for row in np.flatnonzero(tasks == task):
+                    sequence = stream[starts[row] : starts[row] + length]
+                    for name, values in result.items():
+                        values[position, row] = sequence[name]
+        return result
+
+    def batches(
+        self, seeds: Sequence[int], updates: Iterable[int], batch: int, length: int, depth: int = 2
+    ) -> Prefetcher[Batch]:
+        """The batches of `updates` in turn, prepared in the background (see `Prefetcher`).
+
+        All are drawn from the records committed now, even if more are appended meanwhile.
+        """
+        lengths = self.lengths
+
+        def prepare(update: int) -> Batch:
+            return self.sample(seeds, update, batch, length, lengths=lengths)
+
+        return Prefetcher(prepare, updates, depth)
+
+    def _empty(self, shape: tuple[int, ...]) -> Batch:
+        return {
+            name: np.empty(shape + self.dtype[name].shape, self.dtype[name].base)
+            for name in self.dtype.names
+        }
+
+    def _map(self, member: int, task: int) -> np.ndarray:
+        """A stream as a read-only array of records, mapped from its file for one reading.
+
+        Made anew each time (tens of microseconds), so that no map outlives a truncation and a
+        large population holds no more files open than it is reading.
+        """
+        return np.memmap(self.path(member, task), self.dtype, "r")
+
+
+def _write(file, rows: np.ndarray) -> None:
+    file.write(rows.data)
+    file.flush()
+
+
+Prepared = TypeVar("Prepared")
+
+
+class Prefetcher(Generic[Prepared]):
+    """`prepare(item)` for each item in turn, computed ahead in one background thread.
+
+    An iterator and a context manager; leaving it waits for the item in work and drops the rest.
+    An exception in `prepare` is raised by the `next` that would have returned its result.
+
+    Args:
+        prepare: called in the background thread, one item at a time, in order.
+        items: what to prepare, e.g. the numbers of the updates of a round.
+        depth: how many results are prepared ahead at most.
+    """
+
+    def __init__(self, prepare: Callable[[int], Prepared], items: Iterable[int], depth: int = 2):
+        if depth < 1:
+            raise ValueError(f"depth must be at least 1, got {depth}")
+        self._prepare = prepare
+        self._items = iter(items)
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prefetch")
+        self._pending: deque[Future[Prepared]] = deque()
+        for _ in range(depth):
+            self._submit()
+
+    def _submit(self) -> None:
+        for item in self._items:
+            self._pending.append(self._pool.submit(self._prepare, item))
+            return
+
+    def __iter__(self) -> Prefetcher[Prepared]:
+        return self
+
+    def __next__(self) -> Prepared:
+        if not self._pending:
+            self.close()
+            raise StopIteration
+        future = self._pending.popleft()
+        self._submit()
+        return future.result()
+
+    def close(self) -> None:
+        """Stop preparing and wait for the thread; may be called twice."""
+        self._items = iter(())
+        self._pending.clear()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> Prefetcher[Prepared]:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
