@@ -1,0 +1,203 @@
+"""Host simulators as an `Env`: the only file that knows callbacks.
+
+P population member, K tasks, A action. A jitted program reaches a simulator through an ordered
+host callback. JAX refuses to vmap those, so each is wrapped in `custom_vmap`, whose rule hands the
+whole batch to the same callback once more: however many axes are mapped, one tick is one call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.experimental import io_callback
+
+from envs.base import SimulatorError, TaskSpec, TimeStep
+from envs.pool import SimulatorPool
+
+
+class Token(NamedTuple):
+    """What a jitted program holds in place of a simulator's state.
+
+    Attributes:
+        slot: int32 [], which simulator. It must be mapped if anything is.
+        tick: int32 [], how many ticks this slot has made since the environment was built; the
+            host keeps the same count, and a token that was used before is told by it.
+    """
+
+    slot: jax.Array
+    tick: jax.Array
+
+
+def _mapped_callback(host: Callable, results) -> Callable:
+    """An ordered callback that takes any leading axes, in one call of `host`.
+
+    Args:
+        host: called with arrays that share leading axes `lead` (those of the first argument,
+            otherwise a scalar), returns results of shapes lead + the shapes of `results`.
+        results: tree of `jax.ShapeDtypeStruct`, the results for one simulator.
+    """
+
+    @custom_vmap
+    def call(*arguments):
+        lead = arguments[0].shape
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(lead + x.shape, x.dtype), results)
+        return io_callback(host, shapes, *arguments, ordered=True)
+
+    @call.def_vmap
+    def _(axis_size, in_batched, *arguments):
+        arguments = [
+            x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+            for x, batched in zip(arguments, in_batched, strict=True)
+        ]
+        out = call(*arguments)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return call
+
+
+class HostEnv:
+    """An `Env` over simulators that live in worker processes.
+
+    Args:
+        tasks: K tasks; slot s plays tasks[s % K].
+        members: P; there are P * K slots.
+        image_size: height and width of the images in pixels.
+        action_repeat: environment steps for which an action is held.
+        workers: number of worker processes, by default min(cores, slots).
+        action_size: A, at least the largest |A| of the tasks, which is the default.
+    """
+
+    discrete = False
+
+    def __init__(
+        self,
+        tasks: Sequence[TaskSpec],
+        members: int,
+        image_size: int,
+        action_repeat: int,
+        workers: int | None = None,
+        action_size: int | None = None,
+    ):
+        self.tasks = tuple(tasks)
+        self.members = members
+        self.image_size = image_size
+        self.action_repeat = action_repeat
+        largest = max(task.action_size for task in self.tasks)
+        self.action_size = largest if action_size is None else action_size
+        if self.action_size < largest:
+            raise ValueError(
+                f"got action_size={action_size}, but the tasks "
+                f"{[task.name for task in self.tasks]} need at least {largest}"
+            )
+        self._error: BaseException | None = None
+        self._ticks = np.full(members * len(self.tasks), -1, np.int32)
+        self._pool = SimulatorPool(
+            self.tasks * members, image_size, self.action_size, action_repeat, workers
+        )
+        time_step = TimeStep(
+            image=jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
+            reward=jax.ShapeDtypeStruct((), jnp.float32),
+            first=jax.ShapeDtypeStruct((), jnp.bool_),
+            terminal=jax.ShapeDtypeStruct((), jnp.bool_),
+        )
+        tick = jax.ShapeDtypeStruct((), jnp.int32)
+        self._results = (tick, time_step)
+        self._call_reset = _mapped_callback(self._guarded(self._host_reset), self._results)
+        self._call_step = _mapped_callback(self._guarded(self._host_step), self._results)
+
+    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
+        """Put a new simulator, seeded by `key` (typed or raw), into `slot` (int32 [])."""
+        if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+            key = jax.random.key_data(key)
+        slot = jnp.asarray(slot, jnp.int32)
+        tick, time_step = self._call_reset(slot, key)
+        return Token(slot, tick), time_step
+
+    def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
+        """One tick with `action` (float32 [A], clipped to [-1, 1])."""
+        if action.shape != (self.action_size,):
+            raise ValueError(
+                f"got an action of shape {action.shape}, expected {(self.action_size,)}"
+            )
+        tick, time_step = self._call_step(*state, jnp.asarray(action, jnp.float32))
+        return Token(state.slot, tick), time_step
+
+    def check(self) -> None:
+        """Wait for callbacks under way and raise the error that one of them met, if any.
+
+        From the error to this call all ticks are zeros. Afterwards the slots can be reset,
+        unless a worker process has died: then make a new environment.
+        """
+        jax.effects_barrier()
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def close(self) -> None:
+        """End the worker processes."""
+        jax.effects_barrier()
+        self._pool.close()
+
+    def _guarded(self, host: Callable) -> Callable:
+        """`host` over flat batches of NumPy arrays; its errors are kept and zeros returned."""
+
+        def call(*arguments):
+            arguments = [np.asarray(argument) for argument in arguments]
+            lead = arguments[0].shape
+            results = jax.tree.map(lambda x: np.zeros(lead + x.shape, x.dtype), self._results)
+            if self._error is not None:
+                return results
+            try:
+                flat = [x.reshape(-1, *x.shape[len(lead) :]) for x in arguments]
+                return jax.tree.map(
+                    lambda out, like: np.asarray(out, like.dtype).reshape(like.shape),
+                    host(*flat),
+                    results,
+                )
+            except BaseException as error:  # KeyboardInterrupt too: `check` raises it
+                self._error = error
+                return results
+
+        return call
+
+    def _host_reset(self, slots: np.ndarray, keys: np.ndarray):
+        self._check_slots(slots)
+        time_step = self._pool.reset(slots, keys)
+        self._ticks[slots] += 1
+        return self._ticks[slots], time_step
+
+    def _host_step(self, slots: np.ndarray, ticks: np.ndarray, actions: np.ndarray):
+        self._check_slots(slots)
+        for slot, tick, action in zip(slots, ticks, actions, strict=True):
+            now = self._ticks[slot]
+            where = f"slot {slot} ({self._pool.tasks[slot].name})"
+            if now < 0:
+                raise SimulatorError(f"{where} was stepped before it was ever reset")
+            if tick != now:
+                raise SimulatorError(
+                    f"{where} got the state of tick {tick}, but its simulator is at tick {now}: "
+                    "a state can be stepped once, and each step must use the one before's"
+                )
+            if not np.isfinite(action).all():
+                raise SimulatorError(f"{where} got an action that is not finite: {action}")
+        time_step = self._pool.step(slots, actions)
+        self._ticks[slots] += 1
+        return self._ticks[slots], time_step
+
+    def _check_slots(self, slots: np.ndarray) -> None:
+        count = len(self._ticks)
+        if slots.min() < 0 or slots.max() >= count:
+            raise SimulatorError(
+                f"got slots {slots.tolist()}, expected 0 to {count - 1} ({self.members} members "
+                f"x {len(self.tasks)} tasks)"
+            )
+        if len(np.unique(slots)) != len(slots):
+            raise SimulatorError(
+                f"got slots {slots.tolist()}, of which some are alike: map over slots, so that "
+                "every member has its own simulator"
+            )

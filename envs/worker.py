@@ -1,0 +1,153 @@
+"""A process that hosts simulators; the other end of `envs.pool`. Imports no JAX.
+
+Pool and worker talk over a socket, one pickled message each way per request, and pass actions
+and images through shared memory: an array with one record (see `record_type`) per slot.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib
+import mmap
+import os
+import pickle
+import signal
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from envs.base import Simulator, TaskSpec, TimeStep
+from envs.wrappers import ActionPadding, ActionRepeat
+
+
+@dataclass(frozen=True)
+class WorkerSettings:
+    """What a worker is told at its start: the task of each slot it hosts, and the sizes."""
+
+    tasks: dict[int, TaskSpec]
+    slots: int
+    action_size: int
+    image_size: int
+    action_repeat: int
+
+
+def record_type(action_size: int, image_size: int) -> np.dtype:
+    """One slot's place in shared memory: the action going in, the time step coming out."""
+    return np.dtype(
+        [
+            ("action", np.float32, (action_size,)),
+            ("image", np.uint8, (image_size, image_size, 3)),
+            ("reward", np.float32),
+            ("first", np.bool_),
+            ("terminal", np.bool_),
+        ],
+        align=True,
+    )
+
+
+class Phase:
+    """Episodes one after another in one simulator, from one `reset` to the next.
+
+    A phase begins with a simulator made anew, so that nothing before it matters. Within it, an
+    episode follows a fall in the same simulator, which is a hundred times faster; the history
+    it inherits is a function of the phase's key and actions, and so is the whole phase.
+    """
+
+    def __init__(self, make_simulator: Callable[[], Simulator]):
+        self._make_simulator = make_simulator
+        self._simulator: Simulator | None = None
+        self._key: Sequence[int] = ()
+        self._episode = 0
+        self._ended = False
+
+    def reset(self, key: Sequence[int]) -> TimeStep:
+        """Start a phase whose episodes are seeded by `key`, any number of 32-bit words."""
+        self.close()
+        self._simulator = self._make_simulator()
+        self._key = key
+        self._episode = 0
+        return self._start_episode()
+
+    def _start_episode(self) -> TimeStep:
+        words = np.random.SeedSequence([*self._key, self._episode]).generate_state(4)
+        self._simulator.reset(int.from_bytes(words.tobytes(), "little"))
+        self._episode += 1
+        self._ended = False
+        return TimeStep(self._simulator.render(), 0.0, True, False)
+
+    def step(self, action: np.ndarray) -> TimeStep:
+        """One tick: hold `action`, or start the next episode if the last one has ended."""
+        if self._ended:
+            return self._start_episode()
+        outcome = self._simulator.step(action)
+        self._ended = outcome.terminal
+        return TimeStep(self._simulator.render(), outcome.reward, False, outcome.terminal)
+
+    def close(self) -> None:
+        if self._simulator is not None:
+            self._simulator.close()
+            self._simulator = None
+
+
+def _find(entry_point: str) -> Callable[[str, int], Simulator]:
+    module, _, name = entry_point.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _serve(connection: Connection, phases: dict[int, Phase], records: np.ndarray) -> None:
+    """Answer requests until the pool closes the connection or its process is gone."""
+    parent = os.getppid()
+    while True:
+        # The end of the connection is not enough: a fork of the parent may keep it open.
+        while not connection.poll(2.0):
+            if os.getppid() != parent:
+                return
+        command, slots, *arguments = connection.recv()
+        failure = None
+        for i, slot in enumerate(slots):
+            try:
+                if command == "reset":
+                    time_step = phases[slot].reset(arguments[0][i])
+                else:
+                    time_step = phases[slot].step(records[slot]["action"])
+                for name, value in time_step._asdict().items():
+                    records[slot][name] = value
+            except Exception:
+                failure = (slot, traceback.format_exc())
+                break
+        connection.send(failure)
+
+
+def main(connection_descriptor: int, memory_descriptor: int) -> None:
+    """Serve the pool at the other end of the socket; returns when it is gone."""
+    # Ctrl-C is for the process that trains, which ends its phase with our help.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    faulthandler.enable()
+    connection = Connection(connection_descriptor)
+    try:
+        settings: WorkerSettings = connection.recv()
+        layout = record_type(settings.action_size, settings.image_size)
+        memory = mmap.mmap(memory_descriptor, settings.slots * layout.itemsize)
+        records = np.ndarray((settings.slots,), layout, buffer=memory)
+        phases = {}
+        for slot, task in settings.tasks.items():
+            simulator = _find(task.simulator)
+
+            def make(simulator=simulator, task=task) -> Simulator:
+                repeated = ActionRepeat(
+                    simulator(task.title, settings.image_size), settings.action_repeat
+                )
+                return ActionPadding(repeated, task.action_size)
+
+            phases[slot] = Phase(make)
+    except Exception as error:
+        connection.send((pickle.dumps(error), traceback.format_exc()))
+        return
+    connection.send(None)
+    try:
+        _serve(connection, phases, records)
+    except (EOFError, ConnectionError):
+        pass
