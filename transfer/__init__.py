@@ -1,0 +1,66 @@
+"""Move knowledge between pytrees of parameters: select leaves, operate on them, say what happened.
+
+Works on any pytree of arrays (Flax linen and NNX, Equinox, Haiku, Optax states, dataclasses, plain
+containers), alone or stacked as a population, under ``jit`` and ``vmap``.
+
+Axis letters, used everywhere: P population member, N source, M feature, S sample.
+"""
+
+from transfer.plan import OPERATIONS, Plan, Rule, apply, claims, source_leaves
+from transfer.population import replicate, stack, unstack
+from transfer.report import Report
+from transfer.select import (
+    complement,
+    difference,
+    flatten,
+    intersection,
+    paths,
+    select,
+    unflatten,
+    union,
+)
+from transfer.surgery import (
+    average,
+    copy,
+    crop,
+    fraction,
+    interpolate,
+    keep,
+    pad,
+    reinitialise,
+    shrink_perturb,
+    splice,
+    take,
+)
+
+__all__ = [
+    "OPERATIONS",
+    "Plan",
+    "Report",
+    "Rule",
+    "apply",
+    "average",
+    "claims",
+    "complement",
+    "copy",
+    "crop",
+    "difference",
+    "flatten",
+    "fraction",
+    "interpolate",
+    "intersection",
+    "keep",
+    "pad",
+    "paths",
+    "reinitialise",
+    "replicate",
+    "select",
+    "shrink_perturb",
+    "source_leaves",
+    "splice",
+    "stack",
+    "take",
+    "unflatten",
+    "union",
+    "unstack",
+]
