@@ -333,8 +333,7 @@ class Replay:
         lengths = self._lengths if lengths is None else np.asarray(lengths, np.int64)
         if lengths.shape != self._lengths.shape or (lengths > self._lengths).any():
             raise ValueError(
-                f"lengths {lengths.tolist()} are not at most the committed "
-                f"{self._lengths.tolist()}"
+                f"lengths {lengths.tolist()} are not at most the committed {self._lengths.tolist()}"
             )
         result = self._empty((len(members), batch, length))
         for position, (member, seed) in enumerate(zip(members, seeds, strict=True)):
