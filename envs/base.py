@@ -21,11 +21,12 @@ class TaskSpec:
         name: the name in this package, `backend/task`, such as "bullet/hopper".
         title: the name as the thesis prints it, such as "Hopper".
         action_size: |A|, the number of continuous actions, each in [-1, 1].
-        simulator: where to find the simulator, as "module:callable"; called with (title,
-            image_size), it returns a `Simulator`.
+        simulator: where to find its `Simulator`, as "module:callable"; it is called with
+            (title, image_size).
         gymnasium_id: the id under which `gymnasium.make` finds the same task.
         action_repeat: environment steps for which one action is held, unless told otherwise.
         time_limit: length of an episode in environment steps (not in actions).
+        step_seconds: simulated time of one environment step, in seconds.
     """
 
     name: str
@@ -35,6 +36,7 @@ class TaskSpec:
     gymnasium_id: str
     action_repeat: int = 2
     time_limit: int = 1000
+    step_seconds: float = 0.0165
 
 
 class TimeStep(NamedTuple):

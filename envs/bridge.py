@@ -68,8 +68,8 @@ class HostEnv:
         members: P; there are P * K slots.
         image_size: height and width of the images in pixels.
         action_repeat: environment steps for which an action is held.
+        action_size: A, at least the largest |A| of the tasks.
         workers: number of worker processes, by default min(cores, slots).
-        action_size: A, at least the largest |A| of the tasks, which is the default.
     """
 
     discrete = False
@@ -80,24 +80,18 @@ class HostEnv:
         members: int,
         image_size: int,
         action_repeat: int,
+        action_size: int,
         workers: int | None = None,
-        action_size: int | None = None,
     ):
         self.tasks = tuple(tasks)
         self.members = members
         self.image_size = image_size
         self.action_repeat = action_repeat
-        largest = max(task.action_size for task in self.tasks)
-        self.action_size = largest if action_size is None else action_size
-        if self.action_size < largest:
-            raise ValueError(
-                f"got action_size={action_size}, but the tasks "
-                f"{[task.name for task in self.tasks]} need at least {largest}"
-            )
+        self.action_size = action_size
         self._error: BaseException | None = None
         self._ticks = np.full(members * len(self.tasks), -1, np.int32)
         self._pool = SimulatorPool(
-            self.tasks * members, image_size, self.action_size, action_repeat, workers
+            self.tasks * members, image_size, action_size, action_repeat, workers
         )
         time_step = TimeStep(
             image=jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
@@ -111,10 +105,19 @@ class HostEnv:
         self._call_step = _mapped_callback(self._guarded(self._host_step), self._results)
 
     def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
-        """Put a new simulator, seeded by `key` (typed or raw), into `slot` (int32 [])."""
+        """Put a new simulator, seeded by `key` (typed or raw), into `slot` (int32 []).
+
+        Map over `slot`, whatever else is mapped: with nothing mapped all members would share
+        one simulator.
+        """
         if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
             key = jax.random.key_data(key)
         slot = jnp.asarray(slot, jnp.int32)
+        if slot.shape != () or key.ndim != 1:
+            raise ValueError(
+                f"got slots of shape {slot.shape} and keys of shape {key.shape[:-1]}, expected "
+                "one slot and one key: map over several with jax.vmap"
+            )
         tick, time_step = self._call_reset(slot, key)
         return Token(slot, tick), time_step
 
@@ -122,7 +125,8 @@ class HostEnv:
         """One tick with `action` (float32 [A], clipped to [-1, 1])."""
         if action.shape != (self.action_size,):
             raise ValueError(
-                f"got an action of shape {action.shape}, expected {(self.action_size,)}"
+                f"got an action of shape {action.shape}, expected {(self.action_size,)}: "
+                "map over several simulators with jax.vmap"
             )
         tick, time_step = self._call_step(*state, jnp.asarray(action, jnp.float32))
         return Token(state.slot, tick), time_step
@@ -167,8 +171,8 @@ class HostEnv:
 
     def _host_reset(self, slots: np.ndarray, keys: np.ndarray):
         self._check_slots(slots)
+        self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
         time_step = self._pool.reset(slots, keys)
-        self._ticks[slots] += 1
         return self._ticks[slots], time_step
 
     def _host_step(self, slots: np.ndarray, ticks: np.ndarray, actions: np.ndarray):
@@ -185,8 +189,8 @@ class HostEnv:
                 )
             if not np.isfinite(action).all():
                 raise SimulatorError(f"{where} got an action that is not finite: {action}")
+        self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
         time_step = self._pool.step(slots, actions)
-        self._ticks[slots] += 1
         return self._ticks[slots], time_step
 
     def _check_slots(self, slots: np.ndarray) -> None:

@@ -6,6 +6,8 @@ pendulum, whose swing-up variant is defined here (thesis, equation 25).
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 
 from envs.base import Outcome
@@ -20,6 +22,19 @@ except ModuleNotFoundError as error:
         "pip install 'dreamer-transfer[bullet]' (PyBullet has wheels up to Python 3.11 and is "
         "built from source on later ones)."
     ) from error
+
+
+class _Client(BulletClient):
+    """A physics engine of its own, in this process.
+
+    The base class would first look for the engine of another process in shared memory, and
+    prints the options it passes on.
+    """
+
+    def __init__(self):
+        self._shapes = {}
+        self._pid = os.getpid()
+        self._client = pybullet.connect(pybullet.DIRECT)
 
 
 class _DoublePendulumHanging(robot_pendula.InvertedDoublePendulum):
@@ -96,9 +111,7 @@ class BulletSimulator:
         self._env.reset(seed=seed)
 
     def _connect(self) -> None:
-        # The package's own connection first looks for a physics server of another process in
-        # shared memory and would share it, and reads PYBULLET_EGL; a simulator must be alone.
-        client = BulletClient(connection_mode=pybullet.DIRECT)
+        client = _Client()
         client.resetSimulation()
         client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         self._env._p = client

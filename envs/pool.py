@@ -18,6 +18,7 @@ import sys
 import tempfile
 import weakref
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import IO
@@ -49,7 +50,7 @@ class _Worker:
     def death(self) -> SimulatorError:
         """The error that says how the process ended, to be called once it has."""
         code = self.process.wait()
-        cause = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        cause = f"signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"exit code {code}"
         self.output.seek(0)
         said = self.output.read()[-4000:].decode(errors="replace").strip()
         return SimulatorError(
@@ -89,89 +90,110 @@ class SimulatorPool:
         workers: int | None = None,
     ):
         self.tasks = tuple(tasks)
-        count = min(workers or available_cores(), len(self.tasks))
-        layout = record_type(action_size, image_size)
-        # An unlinked file that both sides map; named shared memory would have to be tidied up.
-        memory_file = tempfile.TemporaryFile(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
-        memory_file.truncate(len(self.tasks) * layout.itemsize)
-        memory = mmap.mmap(memory_file.fileno(), 0)
-        self._records = np.ndarray((len(self.tasks),), layout, buffer=memory)
-
+        slots = len(self.tasks)
+        count = min(workers or available_cores(), slots)
         # Slots of one task go to different workers, for tasks differ in cost.
-        by_task = sorted(range(len(self.tasks)), key=lambda slot: self.tasks[slot].name)
-        self._worker_of = np.empty(len(self.tasks), np.int64)
-        self._worker_of[by_task] = np.arange(len(self.tasks)) % count
+        by_task = sorted(range(slots), key=lambda slot: self.tasks[slot].name)
+        self._worker_of = np.empty(slots, np.int64)
+        self._worker_of[by_task] = np.arange(slots) % count
+
+        layout = record_type(action_size, image_size)
+        self._request_number = 0
         self._workers: list[_Worker] = []
-        self._finalizer = weakref.finalize(self, _stop, self._workers)
-        with memory_file:
+        self._stop = weakref.finalize(self, _stop, self._workers)
+        with _shared_file(slots * layout.itemsize) as file:
+            memory = mmap.mmap(file.fileno(), slots * layout.itemsize)
+            self._records = np.ndarray((slots,), layout, buffer=memory)
             for index in range(count):
                 hosted = {int(s): self.tasks[s] for s in np.flatnonzero(self._worker_of == index)}
-                worker = _start(hosted, memory_file.fileno())
-                self._workers.append(worker)
-                worker.connection.send(
-                    WorkerSettings(hosted, len(self.tasks), action_size, image_size, action_repeat)
+                self._workers.append(_start(hosted, file.fileno()))
+                self._workers[-1].connection.send(
+                    WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
                 )
-        for reply in self._replies(range(count)).values():
-            if reply is not None:
-                self.close()
-                error, trace = reply
-                raise pickle.loads(error) from SimulatorError(trace)
+        for failure in self._replies(range(count)):
+            self.close()
+            error, trace = failure
+            raise pickle.loads(error) from SimulatorError(trace)
 
     def reset(self, slots: np.ndarray, keys: np.ndarray) -> TimeStep:
-        """Put new simulators, seeded by `keys` (uint32 [n, words]), into `slots` (int [n])."""
+        """Put new simulators, seeded by `keys` (uint32 [n, words]), into `slots` (int [n]).
+
+        Raises:
+            SimulatorError: if a simulator fails or a process dies, with its task and traceback.
+        """
         return self._request("reset", slots, keys.tolist())
 
     def step(self, slots: np.ndarray, actions: np.ndarray) -> TimeStep:
-        """One tick of `slots` (int [n], no two alike) with `actions` (float32 [n, A])."""
-        self._records["action"][slots] = actions
-        return self._request("step", slots)
+        """One tick of `slots` (int [n], no two alike) with `actions` (float32 [n, A]).
 
-    def _request(self, command: str, slots: np.ndarray, arguments: list | None = None) -> TimeStep:
-        shares = {}
-        for index in np.unique(self._worker_of[slots]):
-            positions = np.flatnonzero(self._worker_of[slots] == index)
-            message = [command, slots[positions].tolist()]
-            if arguments is not None:
-                message.append([arguments[i] for i in positions])
-            shares[int(index)] = message
-        for index, message in shares.items():
-            try:
+        Raises:
+            SimulatorError: if a simulator fails or a process dies, with its task and traceback.
+        """
+        self._records["action"][slots] = actions
+        return self._request("step", slots, [None] * len(slots))
+
+    def _request(self, command: str, slots: np.ndarray, arguments: list) -> TimeStep:
+        if not self._stop.alive:
+            raise SimulatorError("the environment was closed, make a new one")
+        self._request_number += 1
+        workers = np.unique(self._worker_of[slots]).tolist()
+        for index in workers:
+            share = np.flatnonzero(self._worker_of[slots] == index)
+            message = (
+                self._request_number,
+                command,
+                slots[share].tolist(),
+                [arguments[position] for position in share],
+            )
+            # A process that is dead is noticed when its reply is waited for.
+            with suppress(ConnectionError):
                 self._workers[index].connection.send(message)
-            except ConnectionError:
-                raise self._workers[index].death() from None
-        # All replies are read before an error is raised, or the next request would get them.
-        for reply in self._replies(shares).values():
-            if reply is not None:
-                slot, trace = reply
-                raise SimulatorError(
-                    f"The simulator of slot {slot}, {self.tasks[slot].name}, failed:\n{trace}"
-                )
+        for slot, trace in self._replies(workers):
+            raise SimulatorError(
+                f"The simulator of slot {slot}, {self.tasks[slot].name}, failed:\n{trace}"
+            )
         records = self._records[slots]
         return TimeStep(*(records[name].copy() for name in TimeStep._fields))
 
-    def _replies(self, workers: Sequence[int]) -> dict[int, object]:
-        """One reply of each of `workers`; raises if one of them has died."""
-        pending = {self._workers[index].connection: index for index in workers}
-        replies, dead = {}, None
+    def _replies(self, workers: Sequence[int]) -> list:
+        """Wait for a reply of each of `workers`; returns the failures that they report.
+
+        All replies are read before an error is raised. Those to an earlier request, whose wait
+        was interrupted, are passed over.
+        """
+        pending = {self._workers[index].connection: self._workers[index] for index in workers}
+        failures, dead = [], None
         while pending:
+            # Woken now and then, since a fork of a dead worker may keep its connection open.
             for connection in wait(list(pending), timeout=2.0) or list(pending):
-                index = pending[connection]
                 try:
                     if connection.poll():
-                        replies[index] = connection.recv()
-                        del pending[connection]
-                    elif self._workers[index].process.poll() is not None:
+                        number, failure = connection.recv()
+                        if number == self._request_number:
+                            del pending[connection]
+                            if failure is not None:
+                                failures.append(failure)
+                    elif pending[connection].process.poll() is not None:
                         raise EOFError
                 except (EOFError, ConnectionError):
-                    dead = dead or self._workers[index]
-                    del pending[connection]
+                    dead = pending.pop(connection)
         if dead is not None:
             raise dead.death()
-        return replies
+        return failures
 
     def close(self) -> None:
         """End the processes. Also done when the pool is collected or the program ends."""
-        self._finalizer()
+        self._stop()
+
+
+def _shared_file(size: int) -> IO[bytes]:
+    # Without a name there is nothing to tidy up, whichever process dies first.
+    if hasattr(os, "memfd_create"):
+        file = os.fdopen(os.memfd_create("simulators"), "r+b")
+    else:
+        file = tempfile.TemporaryFile()
+    file.truncate(size)
+    return file
 
 
 def _start(tasks: dict[int, TaskSpec], memory_descriptor: int) -> _Worker:

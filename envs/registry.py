@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import pkgutil
 from collections.abc import Sequence
+
+import gymnasium
 
 from envs.base import Env, TaskSpec
 
@@ -29,6 +32,10 @@ _TASKS = {
         _bullet("inverted_double_pendulum", "InvertedDoublePendulum", 1),
     )
 }
+
+# The `Env` of each backend, by the first part of a task's name. Named, not imported: JAX stays
+# out of simulator processes, and a backend's packages need not be installed unless it is used.
+_BACKENDS = {"bullet": "envs.bridge:HostEnv"}
 
 
 def task_names() -> tuple[str, ...]:
@@ -71,7 +78,36 @@ def make(
         ValueError: for an unknown task or a number that is too small.
         ModuleNotFoundError: if the tasks' simulator is not installed, with how to install it.
     """
+    if isinstance(tasks, str):
+        raise ValueError(f"got the string {tasks!r}, expected a list of tasks such as [{tasks!r}]")
     specs = [spec(name) for name in tasks]
-    from envs.bridge import HostEnv  # imports JAX, which simulator processes must not
+    backends = sorted({name.partition("/")[0] for name in tasks})
+    if len(backends) != 1:
+        raise ValueError(
+            f"got tasks {list(tasks)} of backends {backends}, expected at least one task, and "
+            "all of one backend"
+        )
+    numbers = dict(members=members, image_size=image_size, action_repeat=action_repeat)
+    if workers is not None:
+        numbers["workers"] = workers
+    for name, number in numbers.items():
+        if number < 1:
+            raise ValueError(f"got {name}={number}, expected at least 1")
+    largest = max(task.action_size for task in specs)
+    if action_size is not None and action_size < largest:
+        raise ValueError(
+            f"got action_size={action_size}, but of the tasks {list(tasks)} the largest needs "
+            f"{largest}"
+        )
+    make_env = pkgutil.resolve_name(_BACKENDS[backends[0]])
+    return make_env(
+        specs, members, image_size, action_repeat, action_size or largest, workers=workers
+    )
 
-    return HostEnv(specs, members, image_size, action_repeat, workers, action_size)
+
+def register_gymnasium() -> None:
+    """Register every task with gymnasium, as one simulator of the usual interface."""
+    for task in _TASKS.values():
+        gymnasium.register(
+            task.gymnasium_id, entry_point="envs.pixel_env:PixelEnv", kwargs={"task": task}
+        )

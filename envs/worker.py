@@ -7,14 +7,16 @@ and images through shared memory: an array with one record (see `record_type`) p
 from __future__ import annotations
 
 import faulthandler
-import importlib
 import mmap
 import os
 import pickle
+import pkgutil
 import signal
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -92,33 +94,35 @@ class Phase:
             self._simulator = None
 
 
-def _find(entry_point: str) -> Callable[[str, int], Simulator]:
-    module, _, name = entry_point.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
 def _serve(connection: Connection, phases: dict[int, Phase], records: np.ndarray) -> None:
     """Answer requests until the pool closes the connection or its process is gone."""
     parent = os.getppid()
+    actions = records["action"]
+    results = TimeStep(*(records[name] for name in TimeStep._fields))
     while True:
         # The end of the connection is not enough: a fork of the parent may keep it open.
         while not connection.poll(2.0):
             if os.getppid() != parent:
                 return
-        command, slots, *arguments = connection.recv()
+        number, command, slots, arguments = connection.recv()
         failure = None
-        for i, slot in enumerate(slots):
+        for slot, argument in zip(slots, arguments, strict=True):
             try:
                 if command == "reset":
-                    time_step = phases[slot].reset(arguments[0][i])
+                    time_step = phases[slot].reset(argument)
                 else:
-                    time_step = phases[slot].step(records[slot]["action"])
-                for name, value in time_step._asdict().items():
-                    records[slot][name] = value
+                    time_step = phases[slot].step(actions[slot])
+                for result, value in zip(results, time_step, strict=True):
+                    result[slot] = value
             except Exception:
                 failure = (slot, traceback.format_exc())
                 break
-        connection.send(failure)
+        connection.send((number, failure))
+
+
+def _make_simulator(task: TaskSpec, settings: WorkerSettings) -> Simulator:
+    simulator = pkgutil.resolve_name(task.simulator)(task.title, settings.image_size)
+    return ActionPadding(ActionRepeat(simulator, settings.action_repeat), task.action_size)
 
 
 def main(connection_descriptor: int, memory_descriptor: int) -> None:
@@ -127,27 +131,20 @@ def main(connection_descriptor: int, memory_descriptor: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
     connection = Connection(connection_descriptor)
+    settings: WorkerSettings = connection.recv()
     try:
-        settings: WorkerSettings = connection.recv()
-        layout = record_type(settings.action_size, settings.image_size)
-        memory = mmap.mmap(memory_descriptor, settings.slots * layout.itemsize)
-        records = np.ndarray((settings.slots,), layout, buffer=memory)
-        phases = {}
-        for slot, task in settings.tasks.items():
-            simulator = _find(task.simulator)
-
-            def make(simulator=simulator, task=task) -> Simulator:
-                repeated = ActionRepeat(
-                    simulator(task.title, settings.image_size), settings.action_repeat
-                )
-                return ActionPadding(repeated, task.action_size)
-
-            phases[slot] = Phase(make)
+        for task in settings.tasks.values():
+            pkgutil.resolve_name(task.simulator)  # imports the simulators' packages
     except Exception as error:
-        connection.send((pickle.dumps(error), traceback.format_exc()))
+        connection.send((0, (pickle.dumps(error), traceback.format_exc())))
         return
-    connection.send(None)
-    try:
+    layout = record_type(settings.action_size, settings.image_size)
+    memory = mmap.mmap(memory_descriptor, settings.slots * layout.itemsize)
+    records = np.ndarray((settings.slots,), layout, buffer=memory)
+    phases = {
+        slot: Phase(partial(_make_simulator, task, settings))
+        for slot, task in settings.tasks.items()
+    }
+    connection.send((0, None))
+    with suppress(EOFError, ConnectionError):
         _serve(connection, phases, records)
-    except (EOFError, ConnectionError):
-        pass
