@@ -6,7 +6,8 @@ containers), alone or stacked as a population, under ``jit`` and ``vmap``.
 Axis letters, used everywhere: P population member, N source, M feature, S sample.
 """
 
-from transfer.plan import OPERATIONS, Plan, Rule, apply, claims, source_leaves
+from transfer.plan import OPERATIONS, Plan, Rule, apply, claims, frozen, source_leaves
+from transfer.plan_files import read_plan, write_plan
 from transfer.population import replicate, stack, unstack
 from transfer.report import Report
 from transfer.select import (
@@ -47,11 +48,13 @@ __all__ = [
     "difference",
     "flatten",
     "fraction",
+    "frozen",
     "interpolate",
     "intersection",
     "keep",
     "pad",
     "paths",
+    "read_plan",
     "reinitialise",
     "replicate",
     "select",
@@ -63,4 +66,5 @@ __all__ = [
     "unflatten",
     "union",
     "unstack",
+    "write_plan",
 ]

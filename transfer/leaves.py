@@ -36,12 +36,14 @@ INITIALIZERS: dict[str, Callable[..., Callable]] = {
 
 
 def find(source: dict[str, Array], path: str) -> Array:
+    """The source's leaf of a path, or an error with near misses."""
     if path not in source:
         raise ValueError(f"The source has no leaf {path!r}{suggest(path, source)}.")
     return source[path]
 
 
 def check_shape(path: str, target: Array, source: Array) -> None:
+    """Raise unless target and source have one shape."""
     if target.shape == source.shape:
         return
     message = (
@@ -62,6 +64,7 @@ def check_shape(path: str, target: Array, source: Array) -> None:
 
 
 def numeric(path: str, operation: str, *leaves: Array) -> None:
+    """Raise unless all leaves are floating point (or complex)."""
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             raise ValueError(
@@ -71,10 +74,12 @@ def numeric(path: str, operation: str, *leaves: Array) -> None:
 
 
 def wide(leaf: Array) -> Array:
+    """A leaf in the dtype to compute in: float32 at least."""
     return leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
 
 
 def cast(path: str, result: Array, target: Array) -> Array:
+    """A result in the target's dtype, or an error where JAX cannot make it."""
     result = result.astype(target.dtype)
     if result.dtype != target.dtype:
         raise ValueError(
@@ -142,6 +147,7 @@ def same_but(path: str, axis: int, target: Array, source: Array) -> None:
 
 
 def find_initializer(initializer: str | dict[str, Any] | Callable) -> Callable:
+    """An initializer from itself, its name, or ``{"name": ..., **arguments}``."""
     if callable(initializer):
         return initializer
     arguments = dict(initializer) if isinstance(initializer, dict) else {"name": initializer}

@@ -25,6 +25,7 @@ class Row(NamedTuple):
     rule: str
     operation: str
     shape: tuple[int, ...]
+    frozen: bool
     rule_number: int
 
 
@@ -83,6 +84,7 @@ class Report:
                     for name, value in self.parameters[row.rule_number].items()
                 },
                 "shape": row.shape,
+                "frozen": row.frozen,
                 **{name: column[..., index].tolist() for name, column in columns.items()},
             }
             for index, row in enumerate(self.rows)
@@ -116,7 +118,7 @@ class Report:
         return (
             record["leaf"],
             "x".join(map(str, record["shape"])) or "scalar",
-            f"{record['operation']}({arguments})",
+            f"{record['operation']}({arguments})" + (", frozen" if record["frozen"] else ""),
             *(_number(record[name]) for name in _COLUMNS),
         )
 
@@ -154,13 +156,20 @@ def split_parameters(
     """Numbers, which may be traced, apart from settings, which are static and hashable."""
     numbers, settings = {}, []
     for name, value in arguments.items():
-        if isinstance(value, float) or hasattr(value, "dtype"):
+        if _holds_numbers(value):
             numbers[name] = jnp.asarray(value, jnp.float32)
             if members is not None and numbers[name].shape[:1] != (members,):
                 numbers[name] = jnp.broadcast_to(numbers[name], (members, *numbers[name].shape))
         elif value is not None:
             settings.append((name, _static(value)))
     return numbers, tuple(settings)
+
+
+def _holds_numbers(value: Any) -> bool:
+    """Whether a parameter is a number such as ω, not a static axis or a list of positions."""
+    if isinstance(value, list | tuple):
+        return any(_holds_numbers(item) for item in value)
+    return isinstance(value, float) or hasattr(value, "dtype")
 
 
 def _static(value: Any) -> Any:

@@ -147,18 +147,19 @@ def suggest(pattern: str, names: Iterable[str]) -> str:
     return f"; the leaves are {listed or 'none'}"
 
 
-def match_paths(names: Sequence[str], *patterns: str) -> frozenset[str]:
+def match_paths(names: Sequence[str], *patterns: str, optional: bool = False) -> frozenset[str]:
     """The names among ``names`` that the patterns select, taken in order.
 
     Raises:
-        ValueError: a pattern matches no name at all; the message lists near misses.
+        ValueError: a pattern matches no name at all, unless ``optional``; the message lists near
+            misses.
     """
     if not patterns:
         raise ValueError("No pattern was given; '**' selects every leaf.")
     chosen: set[str] = set(names) if patterns[0].startswith("!") else set()
     for pattern in patterns:
         found = {name for name in names if match(pattern.removeprefix("!"), name)}
-        if not found:
+        if not found and not optional:
             raise ValueError(f"Pattern {pattern!r} matches no leaf{suggest(pattern, names)}.")
         chosen = chosen - found if pattern.startswith("!") else chosen | found
     return frozenset(chosen)
