@@ -104,9 +104,7 @@ class Checkpointer:
             temporary.mkdir(parents=True)
             _write_state(temporary, state)
             write_json_atomically(temporary / "metadata.json", _plain(metadata))
-            for later in self.steps():
-                if later >= step:
-                    _remove(self.path(later))
+            replaced = [_retired(self.path(later)) for later in self.steps() if later >= step]
             os.replace(temporary, target)
         except OSError as error:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -119,8 +117,9 @@ class Checkpointer:
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
-        for old in self.steps()[: -self.keep]:
-            _remove(self.path(old))
+        replaced += [_retired(self.path(old)) for old in self.steps()[: -self.keep]]
+        for folder in replaced:
+            shutil.rmtree(folder, ignore_errors=True)
 
     def _clean(self) -> None:
         """Remove what a process killed while saving or removing left behind."""
@@ -401,11 +400,9 @@ def _plain(metadata: Mapping[str, Any]) -> Any:
     }
 
 
-def _remove(folder: Path) -> None:
-    """Delete a checkpoint; one that is half deleted no longer has a checkpoint's name."""
-    leaving = folder.with_name(folder.name + ".old" + _TEMPORARY)
-    os.replace(folder, leaving)
-    shutil.rmtree(leaving, ignore_errors=True)
+def _retired(folder: Path) -> Path:
+    """Take a checkpoint's name from it, so that one half deleted is not taken for whole."""
+    return folder.rename(folder.with_name(f"{folder.name}.old{_TEMPORARY}"))
 
 
 def _first_line(error: Exception) -> str:

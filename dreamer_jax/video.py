@@ -1,0 +1,104 @@
+"""Videos of episodes: frames uint8 [T, height, width, 3] to mp4 or gif.
+
+Axis letters: T frames, N videos side by side.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+_SMALLEST_SIDE = 256  # pixels; smaller frames are enlarged to at least this
+
+
+def write_video(path: str | os.PathLike, frames: np.ndarray, fps: float = 25.0) -> Path:
+    """Write frames as a video; small ones enlarged by a whole factor, pixels staying squares.
+
+    Args:
+        path: ends in .mp4 (H.264) or .gif; its folder is made if absent.
+        frames: uint8 [T, height, width, 3].
+        fps: frames per second.
+
+    Returns:
+        the path.
+
+    Raises:
+        ValueError: the frames have another shape or dtype, there are none, or the suffix is
+            another.
+    """
+    path = Path(path)
+    frames = np.asarray(frames)
+    if frames.ndim != 4 or frames.shape[-1] != 3 or 0 in frames.shape or frames.dtype != np.uint8:
+        raise ValueError(
+            f"frames are {frames.dtype} {list(frames.shape)}, "
+            "expected uint8 [frames, height, width, 3]"
+        )
+    writers = {".mp4": _write_mp4, ".gif": _write_gif}
+    if path.suffix not in writers:
+        raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {sorted(writers)}")
+    if not fps > 0:
+        raise ValueError(f"fps must be positive, got {fps}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Under another name first: a video that is there is whole.
+    temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
+    try:
+        writers[path.suffix](temporary, frames, fps)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def tile(videos: np.ndarray, border: int = 2, colour: int = 255) -> np.ndarray:
+    """Videos side by side: uint8 [N, T, height, width, 3] -> [T, height, wider, 3].
+
+    `border` columns of grey level `colour` stand between neighbours.
+    """
+    videos = np.asarray(videos)
+    if videos.ndim != 5 or videos.shape[-1] != 3 or not len(videos):
+        raise ValueError(
+            f"videos have shape {list(videos.shape)}, expected [videos, frames, height, width, 3]"
+        )
+    bordered = np.pad(videos, ((0, 0), (0, 0), (0, 0), (0, border), (0, 0)), constant_values=colour)
+    row = np.concatenate(list(bordered), axis=2)
+    return row[:, :, : row.shape[2] - border]
+
+
+def _enlarged(frame: np.ndarray, even: bool) -> np.ndarray:
+    """The frame by a whole factor, its sides made even where the video format asks for it."""
+    factor = -(-_SMALLEST_SIDE // min(frame.shape[:2]))
+    if factor > 1:
+        frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
+    if even and (frame.shape[0] % 2 or frame.shape[1] % 2):
+        odd = ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0))
+        frame = np.pad(frame, odd, mode="edge")
+    return np.ascontiguousarray(frame)
+
+
+def _write_mp4(path: Path, frames: np.ndarray, fps: float) -> None:
+    import imageio_ffmpeg
+
+    height, width = _enlarged(frames[0], even=True).shape[:2]
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        (width, height),
+        fps=fps,
+        codec="libx264",
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+    )
+    writer.send(None)
+    try:
+        for frame in frames:
+            writer.send(_enlarged(frame, even=True))
+    finally:
+        writer.close()
+
+
+def _write_gif(path: Path, frames: np.ndarray, fps: float) -> None:
+    import imageio.v3 as imageio
+
+    images = [_enlarged(frame, even=False) for frame in frames]
+    imageio.imwrite(path, images, extension=".gif", duration=1000.0 / fps, loop=0)
