@@ -1,0 +1,440 @@
+"""The host bridge: JAX's transformations, one callback a tick, and what happens on failure.
+
+P member, K task, T ticks. The simulators are fakes whose outputs are known (`fake_simulators`).
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs import SimulatorError, TaskSpec
+from envs.bridge import HostEnv, Token
+
+KEY = jax.random.key(0)
+
+
+def fake(simulator: str, action_size: int = 2) -> TaskSpec:
+    return TaskSpec(
+        name=f"fake/{simulator.lower()}",
+        title=simulator,
+        action_size=action_size,
+        simulator=f"fake_simulators:{simulator}",
+        gymnasium_id="",
+    )
+
+
+@contextmanager
+def env_of(*tasks: TaskSpec, members: int = 1, action_repeat: int = 1, workers: int = 1):
+    action_size = max(task.action_size for task in tasks)
+    env = HostEnv(tasks, members, 4, action_repeat, action_size, workers)
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+@pytest.fixture(scope="module")
+def population():
+    """P = 3 members of K = 2 tasks of 2 and 3 actions, in 2 processes."""
+    with env_of(fake("Counting", 2), fake("Falling", 3), members=3, workers=2) as env:
+        yield env
+
+
+def seed_pixels(images) -> np.ndarray:
+    return np.asarray(images)[..., 0, 0, :]
+
+
+def steps_shown(images) -> np.ndarray:
+    return np.asarray(images)[..., 3, 3, 0]
+
+
+@pytest.mark.parametrize("jit", [True, False], ids=["jitted", "eager"])
+def test_one_slot_can_be_reset_and_stepped(population, jit):
+    reset, step = (jax.jit(f) if jit else f for f in (population.reset, population.step))
+    state, start = reset(jnp.int32(0), KEY)
+    state, then = step(state, jnp.array([0.25, 0.5, 9.0]))
+    population.check()
+    assert start.image.dtype == jnp.uint8 and start.image.shape == (4, 4, 3)
+    assert start.reward.dtype == jnp.float32 and start.reward == 0.0
+    assert bool(start.first) and not start.terminal
+    assert then.reward == 0.75 and steps_shown(then.image) == 1
+    assert not then.first and not then.terminal
+
+
+def test_scan_makes_one_tick_after_another_in_order(population):
+    @jax.jit
+    def phase(key):
+        state, _ = population.reset(jnp.int32(0), key)
+        actions = jnp.arange(12.0).reshape(6, 2) @ jnp.eye(2, 3)
+        return jax.lax.scan(population.step, state, actions)
+
+    _, time_steps = phase(KEY)
+    population.check()
+    assert steps_shown(time_steps.image).tolist() == [1, 2, 3, 4, 5, 6]
+    assert time_steps.reward.tolist() == [1, 5, 9, 13, 17, 21]
+
+
+def test_after_a_fall_the_next_tick_resets_and_ignores_its_action(population):
+    @jax.jit
+    def phase(key):
+        state, start = population.reset(jnp.int32(1), key)
+        _, then = jax.lax.scan(population.step, state, jnp.ones((8, 3)))
+        return start, then
+
+    start, then = phase(KEY)
+    population.check()
+    assert then.terminal.tolist() == [False, False, True, False, False, False, True, False]
+    assert then.first.tolist() == [False, False, False, True, False, False, False, True]
+    assert then.reward.tolist() == [3, 3, 3, 0, 3, 3, 3, 0]
+    assert steps_shown(then.image).tolist() == [1, 2, 3, 0, 1, 2, 3, 0]
+    seeds = seed_pixels(jnp.concatenate([start.image[None], then.image]))[[0, 4, 8]]
+    assert len(np.unique(seeds, axis=0)) == 3, "each episode has a seed of its own"
+
+
+def test_nested_vmap_inside_scan_makes_one_host_call_a_tick(population, monkeypatch):
+    batches = []
+    step = population._pool.step
+    monkeypatch.setattr(
+        population._pool,
+        "step",
+        lambda slots, actions: batches.append(slots.tolist()) or step(slots, actions),
+    )
+
+    @jax.jit
+    def phase(keys):
+        slots = jnp.arange(6).reshape(3, 2)
+        state, _ = jax.vmap(jax.vmap(population.reset))(slots, keys)
+        actions = jnp.broadcast_to(jnp.arange(6.0).reshape(3, 2, 1), (5, 3, 2, 3))
+        return jax.lax.scan(jax.vmap(jax.vmap(population.step)), state, actions)
+
+    _, time_steps = phase(jax.random.split(KEY, (3, 2)))
+    population.check()
+    assert batches == [[0, 1, 2, 3, 4, 5]] * 5
+    assert time_steps.image.shape == (5, 3, 2, 4, 4, 3)
+    # Task 0 reads two of three actions, task 1 all three.
+    assert time_steps.reward[0].tolist() == [[0, 3], [4, 9], [8, 15]]
+
+
+def test_vmap_over_any_axis_reaches_the_same_simulators(population):
+    slots = jnp.arange(6).reshape(3, 2)
+    keys = jax.random.split(KEY, (3, 2))
+    rows, _ = jax.vmap(jax.vmap(population.reset))(slots, keys)
+    columns, start = jax.vmap(jax.vmap(population.reset), in_axes=1, out_axes=1)(slots, keys)
+    population.check()
+    assert columns.slot.tolist() == rows.slot.tolist() == slots.tolist()
+    again = jax.vmap(population.reset)(slots.ravel(), keys.ravel())[1]
+    np.testing.assert_array_equal(start.image.reshape(again.image.shape), again.image)
+
+
+def test_one_shared_key_still_gives_every_member_its_own_simulator(population):
+    @jax.jit
+    def phase(key):
+        reset = jax.vmap(population.reset, in_axes=(0, None))
+        state, start = reset(jnp.array([0, 2, 4]), key)
+        state, _ = jax.vmap(population.step)(state, jnp.zeros((3, 3)))
+        # Only the first member goes on.
+        ahead, _ = population.step(jax.tree.map(lambda x: x[0], state), jnp.zeros(3))
+        state = jax.tree.map(lambda x, y: x.at[0].set(y), state, ahead)
+        return start, jax.vmap(population.step)(state, jnp.zeros((3, 3)))[1]
+
+    start, last = phase(KEY)
+    population.check()
+    assert len(np.unique(seed_pixels(start.image), axis=0)) == 1, "one key, one seed"
+    assert steps_shown(last.image).tolist() == [3, 2, 2], "three simulators"
+
+
+def test_actions_alone_may_be_shared(population):
+    state, _ = jax.vmap(population.reset)(jnp.array([0, 2]), jax.random.split(KEY, 2))
+    _, time_step = jax.vmap(population.step, in_axes=(0, None))(state, jnp.array([1.0, 2.0, 4.0]))
+    population.check()
+    assert time_step.reward.tolist() == [3, 3]
+
+
+def test_a_subset_of_slots_leaves_the_others_where_they_were(population):
+    step = jax.jit(jax.vmap(population.step))
+    state, _ = jax.vmap(population.reset)(jnp.arange(6), jax.random.split(KEY, 6))
+    member_1 = jax.tree.map(lambda x: x[2:4], state)
+    for _ in range(2):
+        member_1, _ = step(member_1, jnp.zeros((2, 3)))
+    state = jax.tree.map(lambda x, y: x.at[2:4].set(y), state, member_1)
+    _, time_step = step(state, jnp.zeros((6, 3)))
+    population.check()
+    assert steps_shown(time_step.image).tolist() == [1, 1, 3, 3, 1, 1]
+
+
+def test_a_phase_depends_on_its_key_alone(population):
+    @jax.jit
+    def phase(key):
+        state, start = population.reset(jnp.int32(1), key)
+        return start, jax.lax.scan(population.step, state, jnp.ones((9, 3)))[1]
+
+    first, other, again = phase(KEY), phase(jax.random.key(1)), phase(KEY)
+    population.check()
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    assert (seed_pixels(first[0].image) != seed_pixels(other[0].image)).any()
+
+
+@pytest.mark.parametrize("make_key", [jax.random.PRNGKey, jax.random.key], ids=["raw", "typed"])
+def test_raw_and_typed_keys_seed_alike(population, make_key):
+    _, time_step = population.reset(jnp.int32(0), make_key(3))
+    _, expected = population.reset(jnp.int32(0), jax.random.key(3))
+    population.check()
+    np.testing.assert_array_equal(time_step.image, expected.image)
+
+
+def test_keys_of_another_generator_work_too(population):
+    keys = jax.random.split(jax.random.key(3, impl="rbg"), 2)
+    _, time_step = jax.vmap(population.reset)(jnp.array([0, 2]), keys)
+    population.check()
+    assert (seed_pixels(time_step.image[0]) != seed_pixels(time_step.image[1])).any()
+
+
+def test_rewards_are_summed_over_the_action_repeat_up_to_a_fall():
+    with env_of(fake("Falling"), action_repeat=2) as env:
+        state, _ = env.reset(jnp.int32(0), KEY)
+        _, time_steps = jax.lax.scan(env.step, state, jnp.ones((4, 2)))
+        env.check()
+        assert time_steps.reward.tolist() == [4, 2, 0, 4]
+        assert time_steps.terminal.tolist() == [False, True, False, False]
+
+
+def test_a_state_that_was_stepped_before_is_refused(population):
+    state, _ = population.reset(jnp.int32(0), KEY)
+    population.step(state, jnp.zeros(3))
+    population.step(state, jnp.zeros(3))
+    with pytest.raises(SimulatorError, match=r"slot 0 \(fake/counting\).* state of tick \d+.*once"):
+        population.check()
+
+
+def test_a_state_from_before_a_reset_is_refused(population):
+    old, _ = population.reset(jnp.int32(0), KEY)
+    population.reset(jnp.int32(0), KEY)
+    population.step(old, jnp.zeros(3))
+    with pytest.raises(SimulatorError, match="can be stepped once"):
+        population.check()
+
+
+def test_a_slot_that_was_never_reset_is_refused():
+    with env_of(fake("Counting")) as env:
+        env.step(Token(jnp.int32(0), jnp.int32(0)), jnp.zeros(2))
+        with pytest.raises(SimulatorError, match="before it was ever reset"):
+            env.check()
+
+
+def test_a_slot_that_does_not_exist_is_refused(population):
+    population.reset(jnp.int32(6), KEY)
+    with pytest.raises(SimulatorError, match=r"\[6\], expected 0 to 5 \(3 members x 2 tasks\)"):
+        population.check()
+
+
+def test_mapping_over_keys_but_not_over_slots_is_refused(population):
+    jax.vmap(population.reset, in_axes=(None, 0))(jnp.int32(0), jax.random.split(KEY, 2))
+    with pytest.raises(SimulatorError, match="map over slots"):
+        population.check()
+
+
+def test_batches_without_vmap_are_refused(population):
+    with pytest.raises(ValueError, match=r"slots of shape \(3,\).*jax.vmap"):
+        population.reset(jnp.arange(3), jax.random.split(KEY, 3))
+    state, _ = population.reset(jnp.int32(0), KEY)
+    with pytest.raises(ValueError, match=r"shape \(2,\), expected \(3,\)"):
+        population.step(state, jnp.zeros(2))
+
+
+def test_an_action_that_is_not_finite_is_an_error_naming_slot_and_task(population):
+    state, _ = jax.vmap(population.reset)(jnp.array([0, 3]), jax.random.split(KEY, 2))
+    actions = jnp.zeros((2, 3)).at[1, 2].set(jnp.nan)
+    _, time_step = jax.vmap(population.step)(state, actions)
+    with pytest.raises(SimulatorError, match=r"slot 3 \(fake/falling\).*not finite.*nan"):
+        population.check()
+    assert not time_step.image.any() and not time_step.reward.any()
+
+
+def test_after_an_error_ticks_are_zero_until_check_and_a_reset_mends_it(population):
+    population.reset(jnp.int32(9), KEY)
+    _, lost = population.reset(jnp.int32(0), KEY)
+    assert not lost.image.any() and not lost.first
+    with pytest.raises(SimulatorError, match="expected 0 to 5"):
+        population.check()
+    population.check()
+    _, found = population.reset(jnp.int32(0), KEY)
+    population.check()
+    assert found.image.any() and found.first
+
+
+def test_an_exception_in_a_worker_arrives_with_its_traceback():
+    with env_of(fake("Counting"), fake("Failing"), workers=2) as env:
+        state, _ = jax.vmap(env.reset)(jnp.arange(2), jax.random.split(KEY, 2))
+        _, time_steps = jax.lax.scan(jax.vmap(env.step), state, jnp.zeros((4, 2, 2)))
+        assert time_steps.image[0].any() and not time_steps.image[1:].any()
+        with pytest.raises(SimulatorError) as error:
+            env.check()
+        assert "slot 1, fake/failing" in str(error.value)
+        assert "ArithmeticError: the contact solver diverged" in str(error.value)
+        # The processes live on: the other task, and this one anew.
+        state, _ = jax.vmap(env.reset)(jnp.arange(2), jax.random.split(KEY, 2))
+        _, time_step = jax.vmap(env.step)(state, jnp.ones((2, 2)))
+        env.check()
+        assert time_step.reward.tolist() == [2, 2]
+
+
+def test_a_worker_that_ends_is_reported_with_its_task_and_last_words():
+    with env_of(fake("Dying"), fake("Counting"), workers=2) as env:
+        state, _ = jax.vmap(env.reset)(jnp.arange(2), jax.random.split(KEY, 2))
+        jax.lax.scan(jax.vmap(env.step), state, jnp.zeros((3, 2, 2)))
+        with pytest.raises(SimulatorError) as error:
+            env.check()
+        assert "fake/dying (slots [0]) ended with exit code 7" in str(error.value)
+        assert "corrupted contact list" in str(error.value)
+        env.reset(jnp.int32(0), KEY)
+        with pytest.raises(SimulatorError, match="exit code 7"):
+            env.check()
+
+
+def test_a_worker_killed_between_ticks_is_reported_and_does_not_hang():
+    with env_of(fake("Counting"), members=2, workers=1) as env:
+        state, _ = jax.vmap(env.reset)(jnp.arange(2), jax.random.split(KEY, 2))
+        os.kill(env._pool._workers[0].process.pid, signal.SIGKILL)
+        jax.vmap(env.step)(state, jnp.zeros((2, 2)))
+        with pytest.raises(SimulatorError, match=r"fake/counting \(slots \[0, 1\]\).*signal 9"):
+            env.check()
+
+
+def test_a_worker_killed_in_the_middle_of_a_tick_is_reported_and_does_not_hang():
+    with env_of(fake("Stuck")) as env:
+        state, _ = env.reset(jnp.int32(0), KEY)
+        pid = env._pool._workers[0].process.pid
+        killer = subprocess.Popen([sys.executable, "-c", KILL_AFTER_A_SECOND, str(pid)])
+        began = time.monotonic()
+        jax.block_until_ready(jax.jit(env.step)(state, jnp.zeros(2)))
+        with pytest.raises(SimulatorError, match="fake/stuck.*signal 9"):
+            env.check()
+        assert time.monotonic() - began < 20
+        killer.wait()
+
+
+def test_a_worker_whose_connection_outlives_it_is_reported_too():
+    with env_of(fake("Orphaning")) as env:
+        state, _ = env.reset(jnp.int32(0), KEY)
+        began = time.monotonic()
+        env.step(state, jnp.zeros(2))
+        with pytest.raises(SimulatorError, match="fake/orphaning.*exit code 7"):
+            env.check()
+        assert time.monotonic() - began < 15
+
+
+KILL_AFTER_A_SECOND = "import os, sys, time; time.sleep(1); os.kill(int(sys.argv[1]), 9)"
+
+
+def test_workers_ignore_the_interrupt_that_is_meant_for_the_training():
+    with env_of(fake("Counting")) as env:
+        os.kill(env._pool._workers[0].process.pid, signal.SIGINT)
+        time.sleep(0.1)
+        state, _ = env.reset(jnp.int32(0), KEY)
+        env.check()
+        assert env._pool._workers[0].process.poll() is None
+
+
+def test_an_interrupted_wait_does_not_mix_up_later_replies(monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    with env_of(fake("Slow")) as env:
+        state, _ = env.reset(jnp.int32(0), KEY)
+        env.check()
+        with monkeypatch.context() as context:
+            context.setattr("envs.pool.wait", interrupted)
+            env.step(state, jnp.ones(2))
+            with pytest.raises(KeyboardInterrupt):
+                env.check()
+        state, start = env.reset(jnp.int32(0), KEY)
+        _, then = env.step(state, 2 * jnp.ones(2))
+        env.check()
+        assert start.first and start.reward == 0
+        assert not then.first and then.reward == 4
+
+
+def test_workers_import_no_jax():
+    with env_of(fake("Modules")) as env:
+        state, _ = env.reset(jnp.int32(0), KEY)
+        _, time_step = env.step(state, jnp.zeros(2))
+        env.check()
+        assert time_step.reward == 0
+
+
+def test_there_are_never_more_workers_than_slots_and_each_task_is_spread_over_them():
+    with env_of(fake("Counting"), fake("Falling"), members=2, workers=2) as env:
+        for worker in env._pool._workers:
+            assert sorted(t.name for t in worker.tasks.values()) == [
+                "fake/counting",
+                "fake/falling",
+            ]
+    with env_of(fake("Counting"), workers=8) as env:
+        assert len(env._pool._workers) == 1
+
+
+def test_workers_end_when_the_environment_is_closed_and_it_says_so_afterwards():
+    with env_of(fake("Counting"), members=2, workers=2) as env:
+        processes = [worker.process for worker in env._pool._workers]
+    assert all(process.poll() == 0 for process in processes)
+    env.close()
+    env.reset(jnp.int32(0), KEY)
+    with pytest.raises(SimulatorError, match="closed"):
+        env.check()
+
+
+SCRIPT_WITHOUT_GUARD = """
+import os, signal, sys, time
+import jax, jax.numpy as jnp
+from test_bridge import fake
+from envs.bridge import HostEnv
+env = HostEnv([fake("Counting")], 2, 4, 1, 2, workers=2)
+state, _ = jax.vmap(env.reset)(jnp.arange(2), jax.random.split(jax.random.key(0), 2))
+_, time_step = jax.vmap(env.step)(state, jnp.ones((2, 2)))
+env.check()
+print(time_step.reward.tolist(), *(w.process.pid for w in env._pool._workers), flush=True)
+if "fork" in sys.argv and os.fork() == 0:
+    os.closerange(0, 3)
+    time.sleep(20)  # holds the connections to the workers open
+    os._exit(0)
+if "die" in sys.argv:
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def is_running(pid: int) -> bool:
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
+@pytest.mark.parametrize("ending", ["exit", "die", "fork die"])
+def test_a_script_without_main_guard_works_and_leaves_no_process_behind(ending):
+    paths = os.pathsep.join(map(os.path.abspath, filter(None, sys.path)))
+    script = subprocess.run(
+        [sys.executable, "-W", "ignore", "-", *ending.split()],
+        input=SCRIPT_WITHOUT_GUARD,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"},
+        timeout=120,
+    )
+    rewards, _, pids = script.stdout.strip().rpartition("] ")
+    assert rewards == "[2.0, 2.0", script.stderr
+    deadline = time.monotonic() + 10
+    while any(map(is_running, map(int, pids.split()))) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(is_running, map(int, pids.split())))
+    assert script.stderr == ""
