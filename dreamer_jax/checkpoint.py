@@ -242,8 +242,14 @@ def _write_state(folder: Path, state: Any) -> None:
         )
     # Orbax stores no empty arrays; their shapes are in the table.
     stored = _nested({path: value for path, value in values.items() if value.size})
-    with _orbax() as checkpointer:
-        checkpointer.save((folder / "state").absolute(), args=ocp.args.PyTreeSave(stored))
+    try:
+        with _orbax() as checkpointer:
+            checkpointer.save((folder / "state").absolute(), args=ocp.args.PyTreeSave(stored))
+    except Exception as error:
+        # TensorStore reports what the system refused as text in errors of several kinds.
+        if code := re.search(r"os_error_code='(\d+)'", str(error)):
+            raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
+        raise
     write_json_atomically(folder / "leaves.json", {"format": _FORMAT, "leaves": table})
 
 
@@ -411,10 +417,10 @@ def _first_line(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _orbax() -> Iterator[ocp.Checkpointer]:
-    """Orbax, writing uncompressed (weights do not compress) and logging errors only."""
+    """Orbax, writing uncompressed (weights do not compress), and quiet: its errors are raised."""
     logger = logging.getLogger("absl")
     level = logger.level
-    logger.setLevel(logging.ERROR)
+    logger.setLevel(logging.CRITICAL)
     try:
         with ocp.Checkpointer(ocp.PyTreeCheckpointHandler(use_compression=False)) as checkpointer:
             yield checkpointer

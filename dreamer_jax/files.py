@@ -12,7 +12,9 @@ from typing import Any
 def write_json_atomically(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as JSON so that `path` holds either the old content or the new one, whole.
 
-    NaN and infinities are refused (`ValueError`): they are not JSON.
+    Raises:
+        ValueError: `value` holds NaN or an infinity, which JSON has no words for.
+        OSError: the disk is full or not writable.
     """
     path = Path(path)
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
@@ -23,9 +25,9 @@ def write_json_atomically(path: str | os.PathLike, value: Any) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError as error:
+    except BaseException:
         temporary.unlink(missing_ok=True)
-        raise explained(error, f"could not write {path}", path) from error
+        raise
 
 
 def read_json(path: str | os.PathLike) -> Any:

@@ -6,7 +6,7 @@ the byte, as that of one that was not; clock times go to `timings.jsonl`. Number
 that they are read back exactly. JSON has no word for numbers that are not finite: they are the
 strings "NaN", "Infinity" and "-Infinity", which `read_metrics` turns into floats again.
 
-The progress bar and the videos of a run have modules of their own; their functions are here too.
+The progress bar and the videos of a run have modules of their own; they can be imported from here too.
 """
 
 from __future__ import annotations
@@ -21,12 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from dreamer_jax.files import explained
-from dreamer_jax.progress import ProgressBar
+from dreamer_jax.progress import Progress
 from dreamer_jax.video import tile, write_video
 
-__all__ = ["MetricsWriter", "progress", "read_metrics", "tile", "write_video"]
-
-progress = ProgressBar
+__all__ = ["MetricsWriter", "Progress", "read_metrics", "tile", "write_video"]
 
 _NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _NOT_PLOTTED = {"member", "seed", "env_steps", "updates"}
@@ -87,13 +85,13 @@ class MetricsWriter:
         """Size of `metrics.jsonl` in bytes, for a checkpoint to commit."""
         return self._metrics.size
 
-    def truncate(self, offset: int | None) -> None:
-        """Drop the rows beyond a committed offset (None: all rows), in TensorBoard's view too.
+    def truncate(self, offset: int) -> None:
+        """Drop the rows beyond a committed offset (0: all rows), in TensorBoard's view too.
 
         Raises:
             ValueError: the file is shorter than that, or the offset is not the end of a line.
         """
-        self._metrics.truncate(offset or 0)
+        self._metrics.truncate(offset)
         if self._tensorboard:
             self._tensorboard.resume(read_metrics(self.path))
 

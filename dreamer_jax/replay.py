@@ -13,6 +13,7 @@ A action. Images are uint8 [height, width, 3] with height = width = `image_size`
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -156,12 +157,12 @@ class Replay:
                 self.path(member, 0).parent.mkdir(exist_ok=True)
                 for task in range(self.tasks):
                     self.path(member, task).touch()
+            # Written last: a folder with a header is complete.
+            write_json_atomically(header, expected)
         except OSError as error:
             raise explained(
                 error, f"could not make the replay folder {self.directory}", self.directory
             ) from error
-        # Written last: a folder with a header is complete.
-        write_json_atomically(header, expected)
 
     def path(self, member: int, task: int) -> Path:
         """The file of one stream."""
@@ -214,7 +215,7 @@ class Replay:
                     file.seek(int(self._lengths[stream]) * self.dtype.itemsize)
                     _write(file, rows)
         except OSError as error:
-            self._cut()
+            self._roll_back()
             raise explained(
                 error,
                 f"could not append {steps} records to {path}",
@@ -222,7 +223,7 @@ class Replay:
                 "every stream still holds what was committed before: make room and resume",
             ) from error
         except BaseException:
-            self._cut()
+            self._roll_back()
             raise
         self._lengths += steps
 
@@ -241,6 +242,11 @@ class Replay:
                     f"{field.base} {list(expected)} (members, tasks, steps, ...)"
                 )
         return arrays
+
+    def _roll_back(self) -> None:
+        # Where cutting fails too, what is beyond the committed lengths is overwritten later.
+        with contextlib.suppress(OSError):
+            self._cut()
 
     def _cut(self) -> None:
         """Drop from the files whatever lies beyond the committed lengths."""
@@ -375,9 +381,11 @@ class Replay:
         """A stream as a read-only array of records, mapped from its file for one reading.
 
         Made anew each time (tens of microseconds), so that no map outlives a truncation and a
-        large population holds no more files open than it is reading.
+        large population holds no more files open than it is reading. Only committed records are
+        mapped: a killed process may have left half of one behind them.
         """
-        return np.memmap(self.path(member, task), self.dtype, "r")
+        shape = (int(self._lengths[member, task]),)
+        return np.memmap(self.path(member, task), self.dtype, "r", shape=shape)
 
 
 def _write(file, rows: np.ndarray) -> None:
