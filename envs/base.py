@@ -126,5 +126,5 @@ class Simulator(Protocol):
         ...
 
     def close(self) -> None:
-        """Free the simulator."""
+        """Free the simulator. It cannot be used afterwards."""
         ...
