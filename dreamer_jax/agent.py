@@ -1,0 +1,535 @@
+"""Dreamer (version 1) as pure functions: init, policy, update (thesis section 3.1, algorithm 3).
+
+Axis letters: P population member, B batch, L sequence length, H imagination horizon, A action,
+M latent feature size, N imagination starts. Everything here is written for one member and maps
+over P with `jax.vmap` or `map_members`.
+
+Parameters are one dict whose names read like the thesis:
+
+    encoder/…  decoder/…  dynamics/{stoch_in, action_in, gru, prior, posterior}/…
+    reward/{hidden_i, out}  value/{hidden_i, out}  actor/{hidden_i, out}
+    termination/{hidden_i, out}, where the option is on
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import chex
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from dreamer_jax import losses, networks, rssm
+from dreamer_jax.config import COMPONENTS, Config
+
+Params = dict[str, Any]
+Metrics = dict[str, jax.Array]
+Mode = Literal["explore", "evaluate"]
+
+
+class Carry(NamedTuple):
+    """What the policy remembers between steps.
+
+    Attributes:
+      state: the latent state.
+      action: float32 [A], the action taken in it.
+    """
+
+    state: rssm.LatentState
+    action: jax.Array
+
+
+@flax.struct.dataclass
+class AgentState:
+    """All that an update reads and writes. A population stacks every leaf on a leading axis P.
+
+    Attributes:
+      params: dict of components.
+      optimisers: Adam's state for each of the groups "model", "value" and "actor".
+      updates: int32 [], updates so far.
+      seed: int32 [], the member's seed; keys derive from it and `updates`.
+      healthy: bool [], False from the first update on whose losses or gradients were not
+        finite: the member is then frozen as it was before that update.
+    """
+
+    params: Params
+    optimisers: dict[str, Any]
+    updates: jax.Array
+    seed: jax.Array
+    healthy: jax.Array
+
+
+class Batch(NamedTuple):
+    """Sequences of records; record t holds image t and the action and reward that led to it.
+
+    Attributes:
+      image: uint8 [B, L, size, size, 3].
+      action: float32 [B, L, A].
+      reward: float32 [B, L].
+      first: bool [B, L], the record is a reset.
+      terminal: bool [B, L], the episode ended here (not merely cut).
+    """
+
+    image: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    first: jax.Array
+    terminal: jax.Array
+
+
+# Salts that keep the streams of random numbers of one seed apart.
+_INIT, _UPDATE = 0, 1
+
+
+def member_key(seed: jax.Array | int, purpose: int) -> jax.Array:
+    """The key of a member for one purpose; members with one seed share it."""
+    return jax.random.fold_in(jax.random.key(seed), purpose)
+
+
+@dataclass(frozen=True)
+class Agent:
+    """The pure functions of an agent of given sizes. Holds no parameters.
+
+    Attributes:
+      config: sizes, losses and exploration (the schedule is not used here).
+      action_size: A.
+      discrete: whether actions are one-hot vectors; else they lie in [-1, 1].
+    """
+
+    config: Config
+    action_size: int
+    discrete: bool = False
+
+    @functools.cached_property
+    def dtype(self):
+        return jnp.dtype(self.config.network.precision)
+
+    @functools.cached_property
+    def encoder(self) -> networks.Encoder:
+        network = self.config.network
+        return networks.Encoder(network.encoder_depth, network.image_size, self.dtype)
+
+    @functools.cached_property
+    def decoder(self) -> networks.Decoder:
+        network = self.config.network
+        return networks.Decoder(network.encoder_depth, network.image_size, self.dtype)
+
+    @functools.cached_property
+    def dynamics(self) -> rssm.Dynamics:
+        network = self.config.network
+        layers = networks.encoder_layers(network.image_size)
+        return rssm.Dynamics(
+            stochastic_size=network.stochastic_size,
+            deterministic_size=network.deterministic_size,
+            hidden_size=network.hidden_size,
+            action_size=self.action_size,
+            # The encoder ends at 2 x 2 pixels.
+            embedding_size=4 * network.encoder_depth * 2 ** (layers - 1),
+            minimum_std=network.minimum_std,
+            dtype=self.dtype,
+        )
+
+    @functools.cached_property
+    def heads(self) -> dict[str, networks.Head]:
+        """The heads on the latent features, by component name."""
+        network = self.config.network
+        outputs = self.action_size if self.discrete else 2 * self.action_size
+        sizes = {
+            "reward": (1, network.reward_layers),
+            "value": (1, network.value_layers),
+            "actor": (outputs, network.actor_layers),
+        }
+        if network.termination:
+            sizes["termination"] = (1, network.termination_layers)
+        return {
+            name: networks.Head(outputs, layers, network.head_units, self.dtype)
+            for name, (outputs, layers) in sizes.items()
+        }
+
+    @functools.cached_property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """The trainable components of each of the three optimisers."""
+        components = [name for name in COMPONENTS if name != "termination" or name in self.heads]
+        trainable = [name for name in components if name not in self.config.learning.frozen]
+        behaviour = ("value", "actor")
+        return {
+            "model": tuple(name for name in trainable if name not in behaviour),
+            **{name: (name,) if name in trainable else () for name in behaviour},
+        }
+
+    @functools.cached_property
+    def _optimisers(self) -> dict[str, optax.GradientTransformation]:
+        learning = self.config.learning
+        rates = {
+            "model": learning.model_learning_rate,
+            "value": learning.value_learning_rate,
+            "actor": learning.actor_learning_rate,
+        }
+        return {
+            name: optax.chain(
+                optax.clip_by_global_norm(learning.gradient_norm),
+                optax.adam(rate, eps=learning.adam_epsilon),
+            )
+            for name, rate in rates.items()
+        }
+
+    def init_params(self, key: jax.Array) -> Params:
+        """Fresh parameters, float32."""
+        size = self.config.network.image_size
+        image = jnp.zeros((1, size, size, 3))
+        features = jnp.zeros((1, self.config.network.feature_size))
+        embedding = jnp.zeros((1, self.dynamics.embedding_size))
+        action = jnp.zeros((1, self.action_size))
+        modules = {
+            "encoder": (self.encoder, (image,)),
+            "decoder": (self.decoder, (features,)),
+            "dynamics": (self.dynamics, (embedding, action)),
+            **{name: (head, (features,)) for name, head in self.heads.items()},
+        }
+        return {
+            # A component's draw depends on its name's place only, so options leave others alone.
+            name: module.init(jax.random.fold_in(key, COMPONENTS.index(name)), *inputs)["params"]
+            for name, (module, inputs) in modules.items()
+        }
+
+    def init(self, seed: jax.Array | int) -> AgentState:
+        """A fresh agent of that seed."""
+        return self.start(self.init_params(member_key(seed, _INIT)), seed)
+
+    def start(self, params: Params, seed: jax.Array | int) -> AgentState:
+        """An agent that starts from given parameters, with fresh optimisers."""
+        optimisers = {
+            name: self._optimisers[name].init({part: params[part] for part in parts})
+            for name, parts in self.groups.items()
+        }
+        return AgentState(
+            params=params,
+            optimisers=optimisers,
+            updates=jnp.int32(0),
+            seed=jnp.asarray(seed, jnp.int32),
+            healthy=jnp.bool_(True),
+        )
+
+    def head(self, params: Params, name: str, features: jax.Array) -> jax.Array:
+        """The outputs of one head: float [..., M] -> float32 [..., outputs]."""
+        return self.heads[name].apply({"params": params[name]}, features)
+
+    def reward(self, params: Params, features: jax.Array) -> jax.Array:
+        """Predicted reward of a latent state: [..., M] -> float32 [...]."""
+        return self.head(params, "reward", features)[..., 0]
+
+    def value(self, params: Params, features: jax.Array) -> jax.Array:
+        """Predicted value of a latent state: [..., M] -> float32 [...]."""
+        return self.head(params, "value", features)[..., 0]
+
+    def encode(self, params: Params, image: jax.Array) -> jax.Array:
+        """Embeddings: uint8 [..., size, size, 3] -> [..., E]."""
+        image = networks.normalise_image(image)
+        return self.encoder.apply({"params": params["encoder"]}, image)
+
+    def decode(self, params: Params, features: jax.Array) -> jax.Array:
+        """Reconstructed images, float32 about [-0.5, 0.5]: [..., M] -> [..., size, size, 3]."""
+        return self.decoder.apply({"params": params["decoder"]}, features)
+
+    def observe(self, params: Params, batch: Batch, key: jax.Array):
+        """Posterior states [B, L, ...] of a batch, and the prior's mean and std beside them."""
+        embeddings = self.encode(params, batch.image)
+        return rssm.observe(
+            self.dynamics, params["dynamics"], embeddings, batch.action, batch.first, key
+        )
+
+    # Acting.
+
+    def initial_carry(self) -> Carry:
+        """The policy's memory before an episode."""
+        return Carry(self.dynamics.initial(), jnp.zeros(self.action_size))
+
+    def policy(
+        self,
+        params: Params,
+        carry: Carry,
+        image: jax.Array,
+        first: jax.Array,
+        key: jax.Array,
+        mode: Mode,
+        updates: jax.Array | int = 0,
+    ) -> tuple[jax.Array, Carry]:
+        """Chooses an action for one image.
+
+        Args:
+          params: the agent's parameters.
+          carry: memory; forgotten where `first`.
+          image: uint8 [size, size, 3].
+          first: bool [], whether the image is the first of an episode.
+          key: for the latent sample, the action and the exploration.
+          mode: "explore" adds exploration to a sample; "evaluate" takes the mode, without noise.
+          updates: int [], updates so far, for the schedule of epsilon-greedy.
+
+        Returns:
+          The action, float32 [A], and the new memory.
+        """
+        latent_key, action_key, explore_key = jax.random.split(key, 3)
+        variables = {"params": params["dynamics"]}
+        projected = self.dynamics.apply(
+            variables, self.encode(params, image[None])[0], method="project"
+        )
+        noise = jax.random.normal(latent_key, carry.state.stochastic.shape)
+        state = self.dynamics.apply(
+            variables, carry.state, carry.action, projected, first, noise, method="obs_step"
+        )
+        outputs = self.head(params, "actor", state.features)
+        if mode == "evaluate":
+            action = self._mode(outputs, action_key)
+        elif mode == "explore":
+            action = self._sample(outputs, self._action_noise(action_key, ()))
+            action = self._explore(action, explore_key, updates)
+        else:
+            raise ValueError(f"unknown policy mode {mode!r}: choose 'explore' or 'evaluate'")
+        return action, Carry(state, action)
+
+    def random_action(self, key: jax.Array) -> jax.Array:
+        """A uniformly random action, float32 [A]."""
+        if self.discrete:
+            choice = jax.random.randint(key, (), 0, self.action_size)
+            return jax.nn.one_hot(choice, self.action_size)
+        return jax.random.uniform(key, (self.action_size,), minval=-1.0, maxval=1.0)
+
+    def _action_noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        draw = jax.random.gumbel if self.discrete else jax.random.normal
+        return draw(key, (*shape, self.action_size))
+
+    def _sample(self, outputs: jax.Array, noise: jax.Array) -> jax.Array:
+        if self.discrete:
+            return networks.one_hot_sample(outputs, noise)
+        return networks.tanh_normal_sample(outputs, noise)
+
+    def _mode(self, outputs: jax.Array, key: jax.Array) -> jax.Array:
+        if self.discrete:
+            return jax.nn.one_hot(jnp.argmax(outputs, -1), self.action_size)
+        return networks.tanh_normal_mode(outputs, key)
+
+    def _explore(self, action: jax.Array, key: jax.Array, updates: jax.Array | int) -> jax.Array:
+        exploration = self.config.exploration
+        if not self.discrete and exploration.kind == "gaussian":
+            noise = exploration.noise * jax.random.normal(key, action.shape)
+            return jnp.clip(action + noise, -1.0, 1.0)
+        schedule = optax.linear_schedule(
+            exploration.epsilon_start, exploration.epsilon_end, exploration.epsilon_decay
+        )
+        choice_key, action_key = jax.random.split(key)
+        explores = jax.random.uniform(choice_key) < schedule(updates)
+        return jnp.where(explores, self.random_action(action_key), action)
+
+    # Learning.
+
+    def update(self, state: AgentState, batch: Batch) -> tuple[AgentState, Metrics]:
+        """One update of model, value and actor, all gradients from the same parameters.
+
+        Args:
+          state: of one member.
+          batch: of one member.
+
+        Returns:
+          The new state, and metrics: float32 scalars by name. Where a loss or gradient is not
+          finite, or was before, all but `updates` stays as it was and `healthy` is False.
+        """
+        chex.assert_rank(batch.image, 5)
+        chex.assert_shape(batch.action, (*batch.reward.shape, self.action_size))
+        chex.assert_equal_shape([batch.reward, batch.first, batch.terminal])
+        key = jax.random.fold_in(member_key(state.seed, _UPDATE), state.updates)
+        model_key, behaviour_key = jax.random.split(key)
+
+        params = state.params
+        parts = {
+            name: {part: params[part] for part in group} for name, group in self.groups.items()
+        }
+        (_, (posterior, metrics)), model_gradient = jax.value_and_grad(
+            self.model_loss, has_aux=True
+        )(parts["model"], params, batch, model_key)
+        (_, (imagined, behaviour_metrics)), actor_gradient = jax.value_and_grad(
+            self.actor_loss, has_aux=True
+        )(parts["actor"], params, posterior, behaviour_key)
+        value_loss, value_gradient = jax.value_and_grad(self.value_loss)(
+            parts["value"], params, imagined
+        )
+        gradients = {"model": model_gradient, "actor": actor_gradient, "value": value_gradient}
+        metrics |= behaviour_metrics | {"value_loss": value_loss}
+        metrics |= {
+            f"{name}_gradient_norm": optax.global_norm(gradient)
+            for name, gradient in gradients.items()
+            if gradient
+        }
+
+        optimisers, new_params = {}, dict(params)
+        for name, gradient in gradients.items():
+            updates, optimisers[name] = self._optimisers[name].update(
+                gradient, state.optimisers[name]
+            )
+            new_params |= optax.apply_updates(parts[name], updates)
+        finite = jnp.isfinite(jnp.stack(list(metrics.values()))).all()
+        healthy = state.healthy & finite
+        new_params, optimisers = jax.tree.map(
+            lambda new, old: jnp.where(healthy, new, old),
+            (new_params, optimisers),
+            (params, state.optimisers),
+        )
+        state = AgentState(new_params, optimisers, state.updates + 1, state.seed, healthy)
+        return state, metrics
+
+    def model_loss(self, trainable: Params, params: Params, batch: Batch, key: jax.Array):
+        """Loss of the world model: image and reward likelihoods and the floored KL divergence.
+
+        Args:
+          trainable: the components that the gradient is taken for.
+          params: all components; those in `trainable` are not used.
+          batch: of one member.
+          key: for the posterior's samples.
+
+        Returns:
+          The loss, and (posterior states [B, L, ...], metrics).
+        """
+        learning = self.config.learning
+        params = params | trainable
+        posterior, prior_mean, prior_std = self.observe(params, batch, key)
+        features = posterior.features
+        image_loss = losses.unit_gaussian_loss(
+            self.decode(params, features), networks.normalise_image(batch.image), event_axes=3
+        )
+        reward_loss = losses.unit_gaussian_loss(self.reward(params, features), batch.reward)
+        kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
+        loss = image_loss + reward_loss
+        loss += learning.kl_scale * losses.floored_kl(kl, learning.free_nats)
+        metrics = {"image_loss": image_loss, "reward_loss": reward_loss, "kl": kl.mean()}
+        if "termination" in self.heads:
+            logits = self.head(params, "termination", features)[..., 0]
+            target = learning.discount * (1.0 - batch.terminal)
+            termination_loss = losses.bernoulli_loss(logits, target)
+            loss += learning.termination_scale * termination_loss
+            metrics["termination_loss"] = termination_loss
+        metrics["model_loss"] = loss
+        return loss, (posterior, metrics)
+
+    def actor_loss(
+        self, trainable: Params, params: Params, posterior: rssm.LatentState, key: jax.Array
+    ):
+        """Loss of the actor, whose gradient comes through the dynamics of imagined states.
+
+        The policy reads stopped features: the gradient reaches an action through the states and
+        rewards that follow it, not through the states that the policy saw before.
+
+        Args:
+          trainable: {"actor": ...}, or empty where the actor is frozen.
+          params: all components.
+          posterior: states to start from, leaves [B, L, ...]; no gradient reaches them.
+          key: for starts, actions and states.
+
+        Returns:
+          The loss, and ((features [H, N, M], returns and weights [H - 1, N]), metrics).
+        """
+        learning = self.config.learning
+        starts_key, action_key, state_key = jax.random.split(key, 3)
+        params = jax.lax.stop_gradient(params) | trainable
+        start = jax.tree.map(lambda x: jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]), posterior)
+        if learning.imagination_starts is not None:
+            count = start.mean.shape[0]
+            chosen = jax.random.permutation(starts_key, count)[: learning.imagination_starts]
+            start = jax.tree.map(lambda x: x[chosen], start)
+
+        def policy(features, noise):
+            outputs = self.head(params, "actor", jax.lax.stop_gradient(features))
+            return self._sample(outputs, noise)
+
+        noise = self._action_noise(action_key, (learning.horizon, start.mean.shape[0]))
+        states = rssm.imagine(
+            self.dynamics, params["dynamics"], policy, start, learning.horizon, state_key, noise
+        )
+        features = states.features
+        rewards = self.reward(params, features)
+        values = self.value(params, features)
+        if "termination" in self.heads:
+            discounts = jax.nn.sigmoid(self.head(params, "termination", features)[..., 0])
+        else:
+            discounts = jnp.full_like(rewards, learning.discount)
+        returns = losses.lambda_return(rewards, values, discounts, learning.return_lambda)
+        weights = losses.trajectory_weights(discounts)
+        loss = losses.actor_loss(returns, weights)
+        metrics = {
+            "actor_loss": loss,
+            "imagined_reward": rewards.mean(),
+            "imagined_value": values.mean(),
+        }
+        return loss, ((features, returns, weights), metrics)
+
+    def value_loss(self, trainable: Params, params: Params, imagined) -> jax.Array:
+        """Loss of the value head on the states that the actor's loss imagined."""
+        features, returns, weights = jax.lax.stop_gradient(imagined)
+        values = self.value(params | trainable, features[:-1])
+        return losses.value_loss(values, returns, weights)
+
+    def predict(
+        self, params: Params, batch: Batch, context: int, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Reconstructs the first images of sequences and predicts the rest from actions alone.
+
+        Args:
+          params: the agent's parameters.
+          batch: sequences without a reset after the context.
+          context: images that are seen.
+          key: for the latent samples.
+
+        Returns:
+          truth and model, float32 [B, L, size, size, 3] in [0, 1].
+        """
+        context_key, rollout_key = jax.random.split(key)
+        seen = Batch(*(x[:, :context] for x in batch))
+        posterior, _, _ = self.observe(params, seen, context_key)
+        start = jax.tree.map(lambda x: x[:, -1], posterior)
+        actions = jnp.swapaxes(batch.action[:, context:], 0, 1)
+        states = rssm.imagine(
+            self.dynamics,
+            params["dynamics"],
+            lambda features, action: action,
+            start,
+            actions.shape[0],
+            rollout_key,
+            actions,
+        )
+        features = jnp.concatenate(
+            [posterior.features, jnp.swapaxes(states.features, 0, 1)], axis=1
+        )
+        truth = networks.normalise_image(batch.image)
+        model = self.decode(params, features)
+        return truth + 0.5, jnp.clip(model + 0.5, 0.0, 1.0)
+
+
+def map_members(function, mapping: str, chunk: int = 1):
+    """Maps a function of one member over a leading axis P of all its arguments.
+
+    Args:
+      function: of trees of one member.
+      mapping: "vmap" runs all members at once, "chunks" `chunk` members after `chunk` members;
+        "auto" is "chunks" on the CPU, where batched small products and grouped convolutions are
+        slower than a loop, and "vmap" elsewhere.
+      chunk: members in a chunk.
+
+    Raises:
+      ValueError: unknown mapping.
+    """
+    if mapping == "auto":
+        mapping = "chunks" if jax.default_backend() == "cpu" else "vmap"
+    if mapping == "vmap":
+        return jax.vmap(function)
+    if mapping != "chunks":
+        raise ValueError(f"unknown mapping {mapping!r}: choose auto, vmap or chunks")
+
+    def mapped(*trees):
+        members = jax.tree.leaves(trees)[0].shape[0]
+        if members == 1:
+            outputs = function(*jax.tree.map(lambda x: x[0], trees))
+            return jax.tree.map(lambda x: x[None], outputs)
+        batch_size = chunk if chunk > 1 else None
+        return jax.lax.map(lambda arguments: function(*arguments), trees, batch_size=batch_size)
+
+    return mapped

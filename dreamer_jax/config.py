@@ -1,0 +1,279 @@
+"""Every setting of an agent and of its training, as frozen dataclasses, and four presets.
+
+The defaults are those of the thesis (sections 3.1 and 4.2.2) and of Dreamer version 1.
+"""
+
+import dataclasses
+import difflib
+from dataclasses import dataclass, field
+from typing import Literal
+
+COMPONENTS = ("encoder", "decoder", "dynamics", "reward", "termination", "value", "actor")
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the networks."""
+
+    image_size: Literal[32, 64] = 64
+    """Height and width of the images, in pixels."""
+    encoder_depth: int = 32
+    """Channels of the first convolution; every further one doubles them."""
+    stochastic_size: int = 30
+    """Size of the stochastic part of the latent state."""
+    deterministic_size: int = 200
+    """Size of the deterministic part of the latent state (the units of the GRU)."""
+    hidden_size: int = 200
+    """Units of the hidden layers inside the dynamics."""
+    head_units: int = 400
+    """Units of the hidden layers of the reward, value, actor and termination heads."""
+    reward_layers: int = 2
+    """Hidden layers of the reward head."""
+    value_layers: int = 3
+    """Hidden layers of the value head."""
+    actor_layers: int = 4
+    """Hidden layers of the actor."""
+    termination: bool = False
+    """Whether to learn a termination head that predicts where episodes end."""
+    termination_layers: int = 3
+    """Hidden layers of the termination head."""
+    minimum_std: float = 0.1
+    """Smallest standard deviation of the latent Gaussians."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Precision of activations; parameters, sums and distributions are always float32."""
+
+    def __post_init__(self):
+        _require(
+            self.image_size in (32, 64),
+            f"image_size is {self.image_size}, but the encoder takes images of 32 or 64 pixels",
+        )
+        for name in ("encoder_depth", "stochastic_size", "deterministic_size", "hidden_size"):
+            _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
+
+    @property
+    def feature_size(self) -> int:
+        """M, the size of the latent features: stochastic and deterministic parts joined."""
+        return self.stochastic_size + self.deterministic_size
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Losses, imagination and optimisers of one update."""
+
+    batch_size: int = 50
+    """B, sequences in a batch."""
+    sequence_length: int = 50
+    """L, records in a sequence."""
+    horizon: int = 15
+    """H, imagined steps."""
+    imagination_starts: int | None = None
+    """Posterior states of a batch from which to imagine; none given: all B * L of them."""
+    discount: float = 0.99
+    """Discount factor of a reward one agent step later (gamma)."""
+    return_lambda: float = 0.95
+    """Weight of longer returns in the lambda-return (lambda of equation 16)."""
+    free_nats: float = 3.0
+    """Floor of the mean KL divergence between posterior and prior, in nats."""
+    kl_scale: float = 1.0
+    """Weight of the KL divergence in the model's loss."""
+    termination_scale: float = 10.0
+    """Weight of the termination head in the model's loss."""
+    model_learning_rate: float = 6e-4
+    """Adam's step size for encoder, decoder, dynamics, reward and termination."""
+    value_learning_rate: float = 8e-5
+    """Adam's step size for the value head."""
+    actor_learning_rate: float = 8e-5
+    """Adam's step size for the actor."""
+    gradient_norm: float = 100.0
+    """Largest norm of the gradient of each of the three groups; larger ones are scaled down."""
+    adam_epsilon: float = 1e-7
+    """Adam's epsilon."""
+    frozen: tuple[str, ...] = ()
+    """Components that take no update (for example the encoder of a universal autoencoder)."""
+
+    def __post_init__(self):
+        unknown = set(self.frozen) - set(COMPONENTS)
+        _require(
+            not unknown,
+            f"cannot freeze {sorted(unknown)}: the components are {', '.join(COMPONENTS)}",
+        )
+        _require(self.horizon >= 2, f"horizon is {self.horizon}, but a return needs at least 2")
+        for name in ("batch_size", "sequence_length"):
+            _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
+        starts, states = self.imagination_starts, self.batch_size * self.sequence_length
+        _require(
+            starts is None or 0 < starts <= states,
+            f"imagination_starts is {starts}, but a batch has {states} posterior states",
+        )
+
+
+@dataclass(frozen=True)
+class ExplorationConfig:
+    """What is added to the actor's samples while collecting."""
+
+    kind: Literal["gaussian", "epsilon_greedy"] = "gaussian"
+    """Gaussian noise (continuous actions) or epsilon-greedy (always used if discrete)."""
+    noise: float = 0.3
+    """Standard deviation of the Gaussian noise, in units of the action range [-1, 1]."""
+    epsilon_start: float = 0.4
+    """Probability of a random action before the first update."""
+    epsilon_end: float = 0.1
+    """Probability of a random action after epsilon_decay updates."""
+    epsilon_decay: int = 200_000
+    """Updates over which epsilon falls linearly."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """When to collect, update, evaluate and save. Environment steps count the action repeat."""
+
+    environment_steps: int = 1_000_000
+    """Length of the run in environment steps, summed over tasks, prefill included."""
+    phase_environment_steps: int = 1000
+    """Environment steps of one task in a phase."""
+    action_repeat: int = 2
+    """Environment steps for which an action is repeated."""
+    prefill_phases: int = 5
+    """Phases of random actions before the first update (several tasks: 1 phase of each)."""
+    updates_per_phase: int = 100
+    """Updates for each phase collected."""
+    evaluate_every: int = 10_000
+    """Environment steps between evaluations."""
+    checkpoint_every: int = 10_000
+    """Environment steps between checkpoints."""
+    mapping: Literal["auto", "vmap", "chunks"] = "auto"
+    """How members of a population are mapped in an update; auto: chunks on CPU, vmap on GPU."""
+    chunk: int = 1
+    """Members in a chunk."""
+
+    def __post_init__(self):
+        _require(
+            self.phase_environment_steps % self.action_repeat == 0,
+            f"phase_environment_steps is {self.phase_environment_steps}, which is no multiple of "
+            f"the action repeat {self.action_repeat}",
+        )
+        for name in ("environment_steps", "evaluate_every", "checkpoint_every", "chunk"):
+            _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
+        _require(self.prefill_phases > 0, "prefill_phases must be at least 1: updates need data")
+
+    @property
+    def phase_ticks(self) -> int:
+        """Agent steps of one task in a phase; a phase has one record more (the reset)."""
+        return self.phase_environment_steps // self.action_repeat
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a run but its tasks, seeds and sources."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    learning: LearningConfig = field(default_factory=LearningConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+
+def _presets() -> dict[str, Config]:
+    small = NetworkConfig(
+        image_size=32,
+        encoder_depth=16,
+        stochastic_size=20,
+        deterministic_size=100,
+        hidden_size=100,
+        head_units=200,
+    )
+    tiny = NetworkConfig(
+        image_size=32,
+        encoder_depth=2,
+        stochastic_size=4,
+        deterministic_size=8,
+        hidden_size=8,
+        head_units=8,
+    )
+    return {
+        "thesis": Config(),
+        "cpu": Config(
+            network=small,
+            learning=LearningConfig(batch_size=16, sequence_length=20),
+            schedule=ScheduleConfig(environment_steps=200_000),
+        ),
+        "demo": Config(
+            network=dataclasses.replace(small, encoder_depth=8),
+            learning=LearningConfig(batch_size=8, sequence_length=20),
+            schedule=ScheduleConfig(
+                environment_steps=10_000,
+                prefill_phases=2,
+                updates_per_phase=20,
+                evaluate_every=1000,
+                checkpoint_every=5000,
+            ),
+        ),
+        "debug": Config(
+            network=tiny,
+            learning=LearningConfig(batch_size=2, sequence_length=5, horizon=3),
+            schedule=ScheduleConfig(
+                environment_steps=160,
+                phase_environment_steps=40,
+                prefill_phases=1,
+                updates_per_phase=2,
+                evaluate_every=40,
+                checkpoint_every=40,
+            ),
+        ),
+    }
+
+
+PRESETS = _presets()
+
+
+def to_dict(config: Config) -> dict:
+    """A configuration as nested dicts that JSON can hold."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict) -> Config:
+    """A configuration from `to_dict`'s result, by way of JSON too.
+
+    Raises:
+      ValueError: a group or setting is unknown; one that is missing takes its default.
+    """
+    groups = {entry.name: entry.default_factory for entry in dataclasses.fields(Config)}
+    unknown = set(values) - set(groups)
+    _require(not unknown, f"unknown settings {sorted(unknown)}: the groups are {list(groups)}")
+    built = {}
+    for name, settings in values.items():
+        known = {entry.name for entry in dataclasses.fields(groups[name])}
+        unknown = set(settings) - known
+        _require(not unknown, f"unknown settings {sorted(unknown)} in the group {name}")
+        # JSON turns tuples into lists.
+        settings = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+        built[name] = groups[name](**settings)
+    return Config(**built)
+
+
+def differences(one: Config, other: Config) -> list[str]:
+    """Settings in which two configurations differ, as "group.name: 1 / 2"."""
+    first, second = to_dict(one), to_dict(other)
+    return [
+        f"{group}.{name}: {first[group][name]} / {second[group][name]}"
+        for group in first
+        for name in first[group]
+        if first[group][name] != second[group][name]
+    ]
+
+
+def preset(name: str) -> Config:
+    """Returns the preset of that name: thesis, cpu (two cores), demo (minutes), debug (seconds).
+
+    Raises:
+      ValueError: there is no such preset.
+    """
+    if name not in PRESETS:
+        near = difflib.get_close_matches(name, PRESETS, n=1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ValueError(f"unknown preset {name!r}{hint}; the presets are {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,157 @@
+"""Phases: a policy and an environment run together for a fixed number of ticks.
+
+Axis letters: P population member, K task, T ticks in a phase (a phase has T + 1 records),
+A action. The environment is any object with `reset(slot, key) -> (state, TimeStep)` and
+`step(state, action) -> (state, TimeStep)` that is traceable and maps under `jax.vmap`, where a
+time step has the fields image, reward, first and terminal; after a terminal tick the next step
+resets.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dreamer_jax.agent import Agent, Params, member_key
+
+Collection = Literal["random", "explore", "evaluate"]
+
+# Salts of the three kinds of phases; 0 and 1 are taken by dreamer_jax.agent.
+_SALTS = {"random": 2, "explore": 2, "evaluate": 3}
+
+
+class Records(NamedTuple):
+    """Record t holds image t and the action and reward that led to it.
+
+    Attributes:
+      image: uint8 [..., T + 1, size, size, 3].
+      action: float32 [..., T + 1, A]; zero where `first`.
+      reward: float32 [..., T + 1]; zero where `first`.
+      first: bool [..., T + 1], the record is a reset.
+      terminal: bool [..., T + 1], the episode ended here.
+    """
+
+    image: Any
+    action: Any
+    reward: Any
+    first: Any
+    terminal: Any
+
+
+def rollout(env, policy: Callable, carry, slot: jax.Array, key: jax.Array, ticks: int) -> Records:
+    """Runs one simulator, made anew, for a phase.
+
+    Args:
+      env: the environment.
+      policy: (carry, image, first, key) -> (action [A], carry).
+      carry: the policy's memory before the phase.
+      slot: int32 [], which simulator.
+      key: seeds the simulator and the policy.
+      ticks: T.
+
+    Returns:
+      Records with leading axis T + 1.
+    """
+    env_key, policy_key = jax.random.split(key)
+    env_state, start = env.reset(slot, env_key)
+
+    def tick(loop, key):
+        env_state, carry, time_step = loop
+        action, carry = policy(carry, time_step.image, time_step.first, key)
+        env_state, time_step = env.step(env_state, action)
+        # A tick that reset ignored its action.
+        action = jnp.where(time_step.first, 0.0, action)
+        return (env_state, carry, time_step), (time_step, action)
+
+    _, (steps, actions) = jax.lax.scan(
+        tick, (env_state, carry, start), jax.random.split(policy_key, ticks)
+    )
+    steps = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, steps)
+    actions = jnp.concatenate([jnp.zeros_like(actions[:1]), actions])
+    return Records(steps.image, actions, steps.reward, steps.first, steps.terminal)
+
+
+def phase_key(seed: jax.Array, task: jax.Array, kind: Collection, phase: jax.Array) -> jax.Array:
+    """The key of one phase: of (member seed, task, collect or evaluate, phase)."""
+    key = member_key(seed, _SALTS[kind])
+    return jax.random.fold_in(jax.random.fold_in(key, task), phase)
+
+
+@functools.partial(jax.jit, static_argnames=("agent", "env", "tasks", "ticks", "kind"))
+def collect(
+    agent: Agent,
+    env,
+    params: Params,
+    seeds: jax.Array,
+    updates: jax.Array,
+    phase: jax.Array,
+    *,
+    tasks: int,
+    ticks: int,
+    kind: Collection,
+) -> Records:
+    """One phase of every task by every member, all simulators in step.
+
+    Args:
+      agent: the agent's functions.
+      env: an environment of P * K slots; slot p * K + k is task k of member p.
+      params: leaves [P, ...]; not used by random phases.
+      seeds: int32 [P].
+      updates: int32 [P], updates so far.
+      phase: int32 [], number of the phase.
+      tasks: K.
+      ticks: T.
+      kind: "random" (prefill), "explore" or "evaluate" (the mode, without noise).
+
+    Returns:
+      Records with leading axes [P, K, T + 1].
+    """
+
+    def one(params, seed, updates, task, slot):
+        def policy(carry, image, first, key):
+            if kind == "random":
+                return agent.random_action(key), carry
+            return agent.policy(params, carry, image, first, key, kind, updates)
+
+        key = phase_key(seed, task, kind, phase)
+        return rollout(env, policy, agent.initial_carry(), slot, key, ticks)
+
+    members = seeds.shape[0]
+    slots = jnp.arange(members * tasks).reshape(members, tasks)
+    over_tasks = jax.vmap(one, in_axes=(None, None, None, 0, 0))
+    over_members = jax.vmap(over_tasks, in_axes=(0, 0, 0, None, 0))
+    return over_members(params, seeds, updates, jnp.arange(tasks), slots)
+
+
+class Episode(NamedTuple):
+    """One episode, or what a phase's end left of it.
+
+    Attributes:
+      start: index of its first record.
+      length: agent steps.
+      score: the return, the undiscounted sum of rewards.
+      fell: whether it ended by itself rather than by the phase's end.
+    """
+
+    start: int
+    length: int
+    score: float
+    fell: bool
+
+
+def episodes(records: Records) -> list[Episode]:
+    """The episodes of one phase of one simulator (leaves [T + 1, ...]), in order."""
+    first = np.flatnonzero(records.first)
+    ends = np.append(first[1:], len(records.first))
+    return [
+        Episode(
+            start=int(start),
+            length=int(end - start - 1),
+            score=float(np.sum(records.reward[start:end], dtype=np.float64)),
+            fell=bool(records.terminal[end - 1]),
+        )
+        for start, end in zip(first, ends, strict=True)
+    ]

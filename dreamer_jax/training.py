@@ -1,0 +1,520 @@
+"""The schedule of a run: prefill, update, collect, evaluate, save (thesis algorithm 3, 3.2.1).
+
+What comes next is a function of a few `Counters`, and every random number derives
+from a member's seed and those counters. So a run that is stopped anywhere and resumed from its
+last checkpoint gives the same metrics, byte for byte, as one that was not.
+
+Axis letters: P population member, K task, B batch, L sequence length, T ticks in a phase.
+"""
+
+import dataclasses
+import functools
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dreamer_jax.agent import Agent, AgentState, Batch, map_members
+from dreamer_jax.checkpoint import Checkpointer
+from dreamer_jax.config import ScheduleConfig
+from dreamer_jax.logs import MetricsWriter
+from dreamer_jax.progress import Progress
+from dreamer_jax.replay import Replay
+from dreamer_jax.rollout import Records, collect, episodes
+from dreamer_jax.video import tile, write_video
+
+MAXIMUM_VIDEO_MEMBERS = 9
+
+
+@dataclass(frozen=True)
+class Member:
+    """One member of a population.
+
+    Attributes:
+      seed: of its parameters, simulators, batches and noise.
+      label: how it is named in messages and metrics.
+      tags: further columns of its metrics (for example omega).
+    """
+
+    seed: int
+    label: str
+    tags: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Counters:
+    """How far a run has come.
+
+    Attributes:
+      rounds: rounds collected, prefill included; a round is one phase of each task.
+      updates: updates made.
+      evaluations: multiples of `evaluate_every` that have been evaluated.
+      averaged: updates in the running sums of metrics.
+    """
+
+    rounds: int = 0
+    updates: int = 0
+    evaluations: int = 0
+    averaged: int = 0
+
+
+Action = Literal["prefill", "update", "evaluate", "collect", "done"]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which action is next, in a run over `tasks` tasks."""
+
+    config: ScheduleConfig
+    tasks: int
+
+    @property
+    def prefill_rounds(self) -> int:
+        """Rounds of random actions: the configured phases, or one of each of several tasks."""
+        return self.config.prefill_phases if self.tasks == 1 else 1
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of the whole run."""
+        return max(
+            self.prefill_rounds,
+            math.ceil(self.config.environment_steps / self.environment_steps(1)),
+        )
+
+    @property
+    def updates(self) -> int:
+        """Updates of the whole run."""
+        return self.updates_due(self.rounds)
+
+    def environment_steps(self, rounds: int) -> int:
+        """Environment steps of `rounds` rounds, summed over tasks."""
+        return rounds * self.tasks * self.config.phase_environment_steps
+
+    def updates_due(self, rounds: int) -> int:
+        """Updates that should have been made after `rounds` rounds."""
+        trained = max(0, rounds - self.prefill_rounds + 1)
+        return trained * self.tasks * self.config.updates_per_phase
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of one member in the whole run; a round that crosses several multiples of
+        `evaluate_every` is followed by one."""
+        rounds = range(self.prefill_rounds, self.rounds + 1)
+        crossed = {self.environment_steps(r) // self.config.evaluate_every for r in rounds}
+        return len(crossed - {0})
+
+    def next(self, done: Counters) -> Action:
+        """What to do after what is done."""
+        if done.rounds < self.prefill_rounds:
+            return "prefill"
+        if done.updates < self.updates_due(done.rounds):
+            return "update"
+        steps = self.environment_steps(done.rounds)
+        if done.evaluations < steps // self.config.evaluate_every:
+            return "evaluate"
+        return "collect" if done.rounds < self.rounds else "done"
+
+
+class NonFiniteError(FloatingPointError):
+    """All members of a population have met losses or gradients that are not finite."""
+
+
+@functools.partial(jax.jit, static_argnames=("agent", "mapping", "chunk"), donate_argnums=(1, 2))
+def update_members(
+    agent: Agent, state: AgentState, sums, batch: Batch, *, mapping: str, chunk: int
+):
+    """One update of every member.
+
+    Args:
+      agent: the agent's functions.
+      state: leaves [P, ...]; its memory is reused.
+      sums: running sums of the metrics, [P] each; its memory is reused.
+      batch: leaves [P, B, L, ...].
+      mapping, chunk: see `dreamer_jax.agent.map_members`.
+
+    Returns:
+      The new state, the new sums, and the model's loss of this update, [P].
+    """
+    state, metrics = map_members(agent.update, mapping, chunk)(state, batch)
+    sums = jax.tree.map(jnp.add, sums, metrics)
+    return state, sums, metrics["model_loss"]
+
+
+@functools.partial(jax.jit, static_argnames="agent")
+def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
+    """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
+    return jax.vmap(agent.init)(seeds)
+
+
+def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> dict:
+    """Sums of metrics before the first update, [P] each, without running an update."""
+    size = agent.config.network.image_size
+    shape = (batch_size, length)
+    batch = Batch(
+        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
+        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
+        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
+        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
+        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
+    )
+    member = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
+    metrics = jax.eval_shape(agent.update, member, batch)[1]
+    members = state.updates.shape[0]
+    return {name: jnp.zeros(members, x.dtype) for name, x in metrics.items()}
+
+
+class StopRequest:
+    """Turns the first Ctrl-C (or SIGTERM) into a request to stop, and lets a second one quit.
+
+    A context manager; outside the main thread it does nothing, as Python allows no more.
+    """
+
+    def __init__(self, notify: Callable[[str], None]):
+        self.requested = False
+        self._notify = notify
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> "StopRequest":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number, frame) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        self._notify("stopping: saving first (once more to quit without)")
+
+
+class Run:
+    """One population in training, and the folder that holds it.
+
+    Args:
+      agent: the agent's functions; `agent.config` holds the schedule too.
+      env: an environment of P * K slots (see `dreamer_jax.rollout`), with a method `check()` that
+        raises what its simulators met.
+      tasks: the names of the K tasks.
+      members: the P members.
+      directory: metrics, checkpoints, replay and videos go here.
+      state: agents to start from, leaves [P, ...]; fresh ones by default.
+      resume: continue from the folder's newest checkpoint (or from the start if there is none).
+      videos: how many of the evaluations are also written as videos, spread over the run.
+
+    Raises:
+      FileExistsError: the folder holds a run, and `resume` is False.
+      ValueError: sizes of the environment, the members and the state do not fit together.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        env,
+        tasks: tuple[str, ...],
+        members: tuple[Member, ...],
+        directory: str | Path,
+        *,
+        state: AgentState | None = None,
+        resume: bool = False,
+        videos: int = 10,
+    ):
+        config = agent.config
+        if env.action_size != agent.action_size:
+            raise ValueError(
+                f"the environment takes actions of size {env.action_size}, the agent gives "
+                f"{agent.action_size}: build both for the same tasks"
+            )
+        if env.image_size != config.network.image_size:
+            raise ValueError(
+                f"the environment renders {env.image_size} pixels, the agent reads "
+                f"{config.network.image_size}: build both with the same image_size"
+            )
+        self.agent, self.env = agent, env
+        self.tasks, self.members = tuple(tasks), tuple(members)
+        self.directory = Path(directory)
+        self.schedule = Schedule(config.schedule, len(self.tasks))
+        self.videos = videos
+        self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
+        self.checkpoints = Checkpointer(self.directory / "checkpoints")
+        self._check_folder(resume)
+
+        self.replay = Replay(
+            self.directory / "replay",
+            members=len(self.members),
+            tasks=len(self.tasks),
+            image_size=config.network.image_size,
+            action_size=agent.action_size,
+        )
+        self.writer = MetricsWriter(self.directory)
+        self.counters = Counters()
+        self.state = init_members(agent, self.seeds) if state is None else state
+        if self.state.updates.shape != (len(self.members),):
+            raise ValueError(
+                f"the state holds {self.state.updates.shape} members, {len(self.members)} are named"
+            )
+        learning = config.learning
+        self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
+        self._restore()
+        self._healthy = np.asarray(self.state.healthy)
+
+    # The folder.
+
+    def _check_folder(self, resume: bool) -> None:
+        if not resume and (self.directory / "replay").exists():
+            raise FileExistsError(
+                f"{self.directory} already holds a run: resume it, or choose another folder"
+            )
+
+    def _restore(self) -> None:
+        """Goes back to the newest checkpoint, or to nothing if there is none."""
+        lengths, offset = np.zeros_like(self.replay.lengths), 0
+        if self.checkpoints.latest() is not None:
+            template = {"agent": self.state, "sums": self.sums}
+            restored, metadata, _ = self.checkpoints.restore(template)
+            self.state, self.sums = restored["agent"], restored["sums"]
+            self.counters = Counters(**metadata["counters"])
+            lengths, offset = metadata["replay"], metadata["metrics"]
+        self.replay.truncate(np.asarray(lengths))
+        self.writer.truncate(offset)
+
+    def save(self) -> None:
+        """Writes a checkpoint of everything that a resumed run needs."""
+        metadata = {
+            "counters": dataclasses.asdict(self.counters),
+            "replay": self.replay.lengths,
+            "metrics": self.writer.offset(),
+        }
+        self.checkpoints.save(self._step(), {"agent": self.state, "sums": self.sums}, metadata)
+
+    def _step(self) -> int:
+        """A number that grows with every action."""
+        return self.counters.rounds + self.counters.updates + self.counters.evaluations
+
+    # The loop.
+
+    def train(self) -> Literal["finished", "stopped"]:
+        """Runs until the schedule is done or a stop is requested, and saves.
+
+        Returns:
+          "finished", or "stopped" after Ctrl-C: `resume` continues.
+
+        Raises:
+          NonFiniteError: no member is healthy any more; what was collected is saved.
+          Exception: what a simulator met; the run is saved as it was before that phase.
+        """
+        schedule = self.schedule
+        with (
+            self._progress_bar() as self._bar,
+            StopRequest(self._bar.message) as stop,
+        ):
+            if self.checkpoints.latest() is None:
+                self.save()
+            saved_steps = schedule.environment_steps(self.counters.rounds)
+            while (action := schedule.next(self.counters)) != "done" and not stop.requested:
+                steps = schedule.environment_steps(self.counters.rounds)
+                every = schedule.config.checkpoint_every
+                if action == "collect" and steps // every > saved_steps // every:
+                    self.save()
+                    saved_steps = steps
+                try:
+                    if action == "update":
+                        self._update(stop)
+                    elif action == "evaluate":
+                        self._evaluate()
+                    else:
+                        self._collect("random" if action == "prefill" else "explore")
+                except (KeyboardInterrupt, NonFiniteError):
+                    raise
+                except Exception:
+                    # Nothing of the failed action has been committed.
+                    self.save()
+                    raise
+            self.save()
+        return "finished" if action == "done" else "stopped"
+
+    def close(self) -> None:
+        """Closes the metrics files. The environment belongs to the caller."""
+        self.writer.close()
+
+    def _progress_bar(self) -> Progress:
+        return Progress(
+            total_env_steps=self.schedule.environment_steps(self.schedule.rounds),
+            total_updates=self.schedule.updates,
+            env_steps=self.schedule.environment_steps(self.counters.rounds),
+            updates=self.counters.updates,
+            description=self.directory.name,
+        )
+
+    def _advance(self, **counters: int) -> None:
+        self.counters = dataclasses.replace(self.counters, **counters)
+
+    def _columns(self, member: int, rounds: int) -> dict[str, Any]:
+        chosen = self.members[member]
+        return {
+            "member": member,
+            "seed": chosen.seed,
+            "label": chosen.label,
+            **chosen.tags,
+            "env_steps": self.schedule.environment_steps(rounds),
+            "updates": self.counters.updates,
+        }
+
+    def _phase(self, kind, phase: int) -> Records:
+        started = time.perf_counter()
+        records = collect(
+            self.agent,
+            self.env,
+            self.state.params,
+            self.seeds,
+            self.state.updates,
+            jnp.int32(phase),
+            tasks=len(self.tasks),
+            ticks=self.schedule.config.phase_ticks,
+            kind=kind,
+        )
+        records = Records(*(np.asarray(x) for x in records))
+        self.env.check()
+        self._time("evaluate" if kind == "evaluate" else "collect", started)
+        return records
+
+    def _collect(self, kind: Literal["random", "explore"]) -> None:
+        self._bar.update(phase="collecting at random" if kind == "random" else "collecting")
+        rounds = self.counters.rounds
+        records = self._phase(kind, rounds)
+        self.replay.append(records._asdict())
+        scores = []
+        for member, task in np.ndindex(len(self.members), len(self.tasks)):
+            found = episodes(Records(*(x[member, task] for x in records)))
+            scores.append(np.mean([episode.score for episode in found]))
+            row = {
+                "kind": "collect",
+                **self._columns(member, rounds + 1),
+                "task": self.tasks[task],
+                "policy": kind,
+                "episodes": len(found),
+                "return": float(scores[-1]),
+                "length": float(np.mean([episode.length for episode in found])),
+            }
+            self.writer.write(row)
+        self._advance(rounds=rounds + 1)
+        self._bar.update(
+            env_steps=self.schedule.environment_steps(rounds + 1), last_return=np.mean(scores)
+        )
+
+    def _update(self, stop: StopRequest) -> None:
+        """Makes the updates that are due, or those until a stop is requested."""
+        self._bar.update(phase="updating")
+        learning, schedule = self.agent.config.learning, self.schedule.config
+        due = self.schedule.updates_due(self.counters.rounds)
+        started, before, loss = time.perf_counter(), self.counters.updates, None
+        with self.replay.batches(
+            np.asarray(self.seeds),
+            range(before, due),
+            learning.batch_size,
+            learning.sequence_length,
+        ) as batches:
+            for update, batch in enumerate(batches, start=before):
+                previous = loss
+                self.state, self.sums, loss = update_members(
+                    self.agent,
+                    self.state,
+                    self.sums,
+                    Batch(**batch),
+                    mapping=schedule.mapping,
+                    chunk=schedule.chunk,
+                )
+                # One update ahead of the device, no more: the next batch is being prepared.
+                if previous is not None:
+                    previous.block_until_ready()
+                self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
+                self._bar.update(updates=update + 1)
+                if stop.requested:
+                    break
+        loss.block_until_ready()
+        self._time("update", started, updates=self.counters.updates - before)
+        if self.counters.updates == due:
+            self._write_averages()
+
+    def _write_averages(self) -> None:
+        count, sums = self.counters.averaged, jax.device_get(self.sums)
+        healthy = np.asarray(self.state.healthy)
+        for member in range(len(self.members)):
+            averages = {name: float(x[member]) / count for name, x in sums.items()}
+            row = {
+                "kind": "update",
+                **self._columns(member, self.counters.rounds),
+                "healthy": bool(healthy[member]),
+                **averages,
+            }
+            self.writer.write(row)
+        for member in np.flatnonzero(self._healthy & ~healthy):
+            chosen = self.members[member]
+            self._bar.message(
+                f"member {member} ({chosen.label}, seed {chosen.seed}) met a loss or gradient that "
+                f"is not finite by update {self.counters.updates}: it is frozen as it was before, "
+                "the others go on"
+            )
+        self._healthy = healthy
+        self.sums = jax.tree.map(jnp.zeros_like, self.sums)
+        self.counters = dataclasses.replace(self.counters, averaged=0)
+        if not healthy.any():
+            self.save()
+            raise NonFiniteError(
+                f"no member of {self.directory} has finite losses any more; lower the learning "
+                "rates or the gradient norm. The last healthy parameters are in its checkpoint"
+            )
+
+    def _evaluate(self) -> None:
+        """One episode per task and member: the mode, without noise, up to the first fall."""
+        self._bar.update(phase="evaluating")
+        index = self.counters.evaluations + 1
+        records = self._phase("evaluate", index)
+        scores = []
+        for member, task in np.ndindex(len(self.members), len(self.tasks)):
+            episode = episodes(Records(*(x[member, task] for x in records)))[0]
+            scores.append(episode.score)
+            row = {
+                "kind": "evaluation",
+                **self._columns(member, self.counters.rounds),
+                "task": self.tasks[task],
+                "return": episode.score,
+                "length": episode.length,
+                "fell": episode.fell,
+            }
+            self.writer.write(row)
+        evaluations = self.schedule.evaluations
+        stride = max(1, evaluations // max(1, self.videos))
+        if self.videos and (index % stride == 0 or index == evaluations):
+            self._write_video(records)
+        # A long round may cross several multiples; they share one evaluation.
+        steps = self.schedule.environment_steps(self.counters.rounds)
+        self._advance(evaluations=steps // self.schedule.config.evaluate_every)
+        self._bar.update(last_return=np.mean(scores))
+
+    def _write_video(self, records: Records) -> None:
+        frames = records.image[:MAXIMUM_VIDEO_MEMBERS]
+        frames = frames.reshape(-1, *frames.shape[2:])
+        steps = self.schedule.environment_steps(self.counters.rounds)
+        path = self.directory / "videos" / f"evaluation_{steps:09d}.mp4"
+        write_video(path, tile(frames), fps=30)
+
+    def _time(self, what: str, started: float, **columns) -> None:
+        row = {
+            "kind": what,
+            "seconds": time.perf_counter() - started,
+            "env_steps": self.schedule.environment_steps(self.counters.rounds),
+            **columns,
+        }
+        self.writer.write_timing(row)
