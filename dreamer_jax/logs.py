@@ -6,7 +6,7 @@ the byte, as that of one that was not; clock times go to `timings.jsonl`. Number
 that they are read back exactly. JSON has no word for numbers that are not finite: they are the
 strings "NaN", "Infinity" and "-Infinity", which `read_metrics` turns into floats again.
 
-The progress bar and the videos of a run have modules of their own; they can be imported from here too.
+The progress bar and the videos of a run, modules of their own, can be imported from here too.
 """
 
 from __future__ import annotations
