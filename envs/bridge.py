@@ -150,48 +150,52 @@ class HostEnv:
     def _guarded(self, host: Callable) -> Callable:
         """`host` over flat batches of NumPy arrays; its errors are kept and zeros returned."""
 
-        def call(*arguments):
-            arguments = [np.asarray(argument) for argument in arguments]
-            lead = arguments[0].shape
-            results = jax.tree.map(lambda x: np.zeros(lead + x.shape, x.dtype), self._results)
-            if self._error is not None:
-                return results
-            try:
-                flat = [x.reshape(-1, *x.shape[len(lead) :]) for x in arguments]
-                return jax.tree.map(
-                    lambda out, like: np.asarray(out, like.dtype).reshape(like.shape),
-                    host(*flat),
-                    results,
-                )
-            except BaseException as error:  # KeyboardInterrupt too: `check` raises it
-                self._error = error
-                return results
+        def call(slot, *others):
+            slot = np.asarray(slot)
+            lead, count = slot.shape, slot.size
+            if self._error is None:
+                try:
+                    others = [np.asarray(x) for x in others]
+                    others = [x.reshape(count, *x.shape[len(lead) :]) for x in others]
+                    tick, time_step = host(slot.reshape(count), *others)
+                    return tick.reshape(lead), TimeStep(
+                        *(leaf.reshape(lead + leaf.shape[1:]) for leaf in time_step)
+                    )
+                except BaseException as error:  # KeyboardInterrupt too: `check` raises it
+                    self._error = error
+            return jax.tree.map(lambda x: np.zeros(lead + x.shape, x.dtype), self._results)
 
         return call
 
-    def _host_reset(self, slots: np.ndarray, keys: np.ndarray):
+    def _host_reset(self, slots: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, TimeStep]:
         self._check_slots(slots)
         self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
         time_step = self._pool.reset(slots, keys)
         return self._ticks[slots], time_step
 
-    def _host_step(self, slots: np.ndarray, ticks: np.ndarray, actions: np.ndarray):
+    def _host_step(
+        self, slots: np.ndarray, ticks: np.ndarray, actions: np.ndarray
+    ) -> tuple[np.ndarray, TimeStep]:
         self._check_slots(slots)
-        for slot, tick, action in zip(slots, ticks, actions, strict=True):
-            now = self._ticks[slot]
-            where = f"slot {slot} ({self._pool.tasks[slot].name})"
-            if now < 0:
-                raise SimulatorError(f"{where} was stepped before it was ever reset")
-            if tick != now:
-                raise SimulatorError(
-                    f"{where} got the state of tick {tick}, but its simulator is at tick {now}: "
-                    "a state can be stepped once, and each step must use the one before's"
-                )
-            if not np.isfinite(action).all():
-                raise SimulatorError(f"{where} got an action that is not finite: {action}")
+        now = self._ticks[slots]
+        for i in np.flatnonzero(now < 0):
+            raise SimulatorError(f"{self._name(slots[i])} was stepped before it was ever reset")
+        for i in np.flatnonzero(ticks != now):
+            raise SimulatorError(
+                f"{self._name(slots[i])} got the state of tick {ticks[i]}, but its simulator is at "
+                f"tick {now[i]}: a state can be stepped once, and each step must use the one "
+                "before's"
+            )
+        for i in np.flatnonzero(~np.isfinite(actions).all(axis=1)):
+            raise SimulatorError(
+                f"{self._name(slots[i])} got an action that is not finite: {actions[i]}"
+            )
         self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
         time_step = self._pool.step(slots, actions)
         return self._ticks[slots], time_step
+
+    def _name(self, slot: int) -> str:
+        return f"slot {slot} ({self._pool.tasks[slot].name})"
 
     def _check_slots(self, slots: np.ndarray) -> None:
         count = len(self._ticks)
@@ -200,7 +204,7 @@ class HostEnv:
                 f"got slots {slots.tolist()}, expected 0 to {count - 1} ({self.members} members "
                 f"x {len(self.tasks)} tasks)"
             )
-        if len(np.unique(slots)) != len(slots):
+        if len(set(slots.tolist())) != len(slots):
             raise SimulatorError(
                 f"got slots {slots.tolist()}, of which some are alike: map over slots, so that "
                 "every member has its own simulator"

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -94,8 +94,7 @@ class SimulatorPool:
         count = min(workers or available_cores(), slots)
         # Slots of one task go to different workers, for tasks differ in cost.
         by_task = sorted(range(slots), key=lambda slot: self.tasks[slot].name)
-        self._worker_of = np.empty(slots, np.int64)
-        self._worker_of[by_task] = np.arange(slots) % count
+        self._worker_of = {slot: index % count for index, slot in enumerate(by_task)}
 
         layout = record_type(action_size, image_size)
         self._request_number = 0
@@ -105,7 +104,7 @@ class SimulatorPool:
             memory = mmap.mmap(file.fileno(), slots * layout.itemsize)
             self._records = np.ndarray((slots,), layout, buffer=memory)
             for index in range(count):
-                hosted = {int(s): self.tasks[s] for s in np.flatnonzero(self._worker_of == index)}
+                hosted = {s: self.tasks[s] for s in range(slots) if self._worker_of[s] == index}
                 self._workers.append(_start(hosted, file.fileno()))
                 self._workers[-1].connection.send(
                     WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
@@ -136,26 +135,22 @@ class SimulatorPool:
         if not self._stop.alive:
             raise SimulatorError("the environment was closed, make a new one")
         self._request_number += 1
-        workers = np.unique(self._worker_of[slots]).tolist()
-        for index in workers:
-            share = np.flatnonzero(self._worker_of[slots] == index)
-            message = (
-                self._request_number,
-                command,
-                slots[share].tolist(),
-                [arguments[position] for position in share],
-            )
+        shares: dict[int, tuple[list, list]] = {}
+        for slot, argument in zip(slots.tolist(), arguments, strict=True):
+            share = shares.setdefault(self._worker_of[slot], ([], []))
+            share[0].append(slot)
+            share[1].append(argument)
+        for index, share in shares.items():
             # A process that is dead is noticed when its reply is waited for.
             with suppress(ConnectionError):
-                self._workers[index].connection.send(message)
-        for slot, trace in self._replies(workers):
+                self._workers[index].connection.send((self._request_number, command, *share))
+        for slot, trace in self._replies(shares):
             raise SimulatorError(
                 f"The simulator of slot {slot}, {self.tasks[slot].name}, failed:\n{trace}"
             )
-        records = self._records[slots]
-        return TimeStep(*(records[name].copy() for name in TimeStep._fields))
+        return TimeStep(*(self._records[name][slots] for name in TimeStep._fields))
 
-    def _replies(self, workers: Sequence[int]) -> list:
+    def _replies(self, workers: Iterable[int]) -> list:
         """Wait for a reply of each of `workers`; returns the failures that they report.
 
         All replies are read before an error is raised. Those to an earlier request, whose wait
