@@ -6,6 +6,15 @@ containers), alone or stacked as a population, under ``jit`` and ``vmap``.
 Axis letters, used everywhere: P population member, N source, M feature, S sample.
 """
 
+from transfer.files import load, save
+from transfer.freeze import (
+    combine,
+    freeze,
+    partition,
+    scale_learning_rates,
+    stop_gradient,
+    unfreeze_gradually,
+)
 from transfer.plan import OPERATIONS, Plan, Rule, apply, claims, frozen, source_leaves
 from transfer.plan_files import read_plan, write_plan
 from transfer.population import replicate, stack, unstack
@@ -42,28 +51,36 @@ __all__ = [
     "apply",
     "average",
     "claims",
+    "combine",
     "complement",
     "copy",
     "crop",
     "difference",
     "flatten",
     "fraction",
+    "freeze",
     "frozen",
     "interpolate",
     "intersection",
     "keep",
+    "load",
     "pad",
+    "partition",
     "paths",
     "read_plan",
     "reinitialise",
     "replicate",
+    "save",
+    "scale_learning_rates",
     "select",
     "shrink_perturb",
     "source_leaves",
     "splice",
     "stack",
+    "stop_gradient",
     "take",
     "unflatten",
+    "unfreeze_gradually",
     "union",
     "unstack",
     "write_plan",

@@ -80,13 +80,15 @@ def wide(leaf: Array) -> Array:
 
 def cast(path: str, result: Array, target: Array) -> Array:
     """A result in the target's dtype, or an error where JAX cannot make it."""
-    result = result.astype(target.dtype)
-    if result.dtype != target.dtype:
+    if result.dtype == target.dtype:
+        return result
+    possible = jax.dtypes.canonicalize_dtype(target.dtype)
+    if isinstance(result, jax.Array) and possible != target.dtype:
         raise ValueError(
-            f"{path}: the target is {target.dtype}, but JAX made {result.dtype} of it; set "
-            "jax_enable_x64, or convert the target first."
+            f"{path}: the target is {target.dtype}, which JAX does not make unless jax_enable_x64 "
+            "is set; set it, or convert the target first."
         )
-    return result
+    return result.astype(target.dtype)
 
 
 def per_member(path: str, name: str, value: Any, leaf: Array) -> Array:

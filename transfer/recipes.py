@@ -4,16 +4,31 @@ The paths are those of a Dreamer agent whose parameters are one dictionary:
 
     encoder/...  decoder/...  dynamics/{stoch_in, action_in, gru, prior, posterior}/...
     reward/{hidden_i, out}  value/{hidden_i, out}  actor/{hidden_i, out}
-    termination/{hidden_i, out}                                            (where there is one)
+    termination/{hidden_i, out}                                        (where there is one)
 
 This module knows these names and nothing else of the agent. The target of every recipe is a
 freshly initialised tree, so that ``keep`` is random initialisation. Optimiser state is fresh.
 """
 
+from collections.abc import Sequence
+from typing import Any, Literal
+
 from transfer.plan import Plan, Rule
 
+# The last layer of each component that may be fractionally transferred.
+_LAST_LAYERS = {
+    "reward": "reward/out/*",
+    "value": "value/out/*",
+    "termination": "termination/out/*",
+    "actor": "actor/out/*",
+    "dynamics": "dynamics/*/out/*",
+}
+_OPTIONAL = ("termination",)
 
-def fractional_transfer(omega: float | None = None) -> Plan:
+
+def fractional_transfer(
+    omega: Any = None, *, fractions: Sequence[str] = ("reward", "value", "termination")
+) -> Plan:
     """Fractional transfer learning to Dreamer (thesis §3.2.3, Figure 8).
 
     Fully transferred: encoder, decoder, dynamics and the hidden layers of all heads. Randomly
@@ -28,22 +43,112 @@ def fractional_transfer(omega: float | None = None) -> Plan:
     Args:
         omega: ω in [0, 1], a scalar; or [P] for a stacked population. ``None`` leaves it open, to
             be given as ``apply(plan, target, source, omega=...)``, where it may be traced.
+        fractions: the components whose last layer is fractionally transferred. Beyond the
+            thesis: without "reward" or "value" that last layer is drawn anew; "dynamics" adds the
+            last layers of prior and posterior; "actor" the actor's, where the action sizes of
+            source and target are the same.
+
+    Raises:
+        ValueError: an unknown component in ``fractions``.
     """
+    for component in fractions:
+        if component not in _LAST_LAYERS:
+            raise ValueError(
+                f"There is no fraction for {component!r}; choose from {', '.join(_LAST_LAYERS)}."
+            )
     parameters = {} if omega is None else {"omega": omega}
+
+    def last_layer(component: str) -> Rule:
+        optional = component in _OPTIONAL
+        if component in fractions:
+            note = "equation 19" if component in ("reward", "value") else "equation 19, added"
+            return Rule(
+                _LAST_LAYERS[component], "fraction", parameters, optional=optional, note=note
+            )
+        note = "random: actions differ" if component == "actor" else "random"
+        return Rule(_LAST_LAYERS[component], "keep", optional=optional, note=note)
+
+    def head(component: str) -> tuple[Rule, Rule]:
+        hidden = Rule(
+            f"{component}/hidden_*/*",
+            "copy",
+            optional=component in _OPTIONAL,
+            note="feature extraction",
+        )
+        return hidden, last_layer(component)
+
+    dynamics = ["dynamics/**", "!dynamics/action_in/*"]
+    if "dynamics" in fractions:
+        dynamics.append("!" + _LAST_LAYERS["dynamics"])
     return Plan(
         name="fractional transfer learning",
         rules=(
-            Rule("encoder/**", "copy", note="representation: visually alike domains"),
-            Rule("decoder/**", "copy", note="representation: visually alike domains"),
-            Rule(("dynamics/**", "!dynamics/action_in/**"), "copy", note="the same physics"),
-            Rule("dynamics/action_in/**", "keep", note="random: actions differ"),
-            Rule("reward/hidden_*/**", "copy", note="feature extraction"),
-            Rule("reward/out/*", "fraction", parameters, note="equation 19"),
-            Rule("value/hidden_*/**", "copy", note="feature extraction"),
-            Rule("value/out/*", "fraction", parameters, note="equation 19"),
-            Rule("actor/hidden_*/**", "copy", note="feature extraction"),
-            Rule("actor/out/*", "keep", note="random: actions differ"),
-            Rule("termination/hidden_*/**", "copy", optional=True, note="feature extraction"),
-            Rule("termination/out/*", "fraction", parameters, optional=True, note="as the reward"),
+            Rule("encoder/**", "copy", note="visually similar domains"),
+            Rule("decoder/**", "copy", note="visually similar domains"),
+            Rule(tuple(dynamics), "copy", note="the same physics"),
+            *((last_layer("dynamics"),) if "dynamics" in fractions else ()),
+            Rule("dynamics/action_in/*", "keep", note="random: actions differ"),
+            *head("reward"),
+            *head("value"),
+            *head("actor"),
+            *head("termination"),
         ),
     )
+
+
+def universal_autoencoder(dynamics: Literal["fresh", "copied", "frozen"] = "fresh") -> Plan:
+    """A target on the autoencoder of an agent trained on several tasks (thesis §3.3.1, Figure 9).
+
+    Encoder and decoder are copied; the encoder is frozen (see :func:`transfer.frozen`), so that all
+    agents made by this recipe share one feature space; the decoder trains on. Heads are fresh. The
+    agents whose models are stored, the target of a meta-model, and those that latent task
+    classification samples are all made by it.
+
+    Args:
+        dynamics: ``"fresh"`` as in the author's runs: only the encoder's embedding is universal,
+            while the latent state that heads read is each agent's own. ``"copied"``: each agent
+            starts from the source's dynamics. ``"frozen"``: and keeps them, but for the kernel of
+            the action, which is always fresh and trains.
+
+    Raises:
+        ValueError: another value of ``dynamics``.
+    """
+    if dynamics not in ("fresh", "copied", "frozen"):
+        raise ValueError(f"dynamics is 'fresh', 'copied' or 'frozen'; got {dynamics!r}.")
+    if dynamics == "fresh":
+        rules = (Rule("dynamics/**", "keep", note="random"),)
+    else:
+        rules = (
+            Rule(
+                ("dynamics/**", "!dynamics/action_in/*"),
+                "copy",
+                frozen=dynamics == "frozen",
+                note="the same physics",
+            ),
+            Rule("dynamics/action_in/*", "keep", note="random: actions differ"),
+        )
+    return Plan(
+        name=f"universal autoencoder, {dynamics} dynamics",
+        rules=(
+            Rule("encoder/**", "copy", frozen=True, note="the universal features"),
+            Rule("decoder/**", "copy", note="trains on"),
+            *rules,
+            Rule("reward/**", "keep", note="random"),
+            Rule("value/**", "keep", note="random"),
+            Rule("actor/**", "keep", note="random"),
+            Rule("termination/**", "keep", optional=True, note="random"),
+        ),
+    )
+
+
+LATENT_TASK_THRESHOLDS = (50.0, 70.0, 90.0)
+"""ξ of the thesis's tables for M = 230 features (§4.3.2 prints 0.5, 0.7 and 0.9)."""
+
+
+def latent_task_thresholds(features: int) -> tuple[float, ...]:
+    """The thesis's ξ for M = ``features``: a Manhattan distance grows with the size, ξ·M/230.
+
+    >>> latent_task_thresholds(115)
+    (25.0, 35.0, 45.0)
+    """
+    return tuple(threshold * features / 230 for threshold in LATENT_TASK_THRESHOLDS)

@@ -19,7 +19,18 @@ Array = Any
 
 
 class Row(NamedTuple):
-    """What is known of a leaf before any number is computed."""
+    """What is known of a leaf before any number is computed.
+
+    Attributes:
+        leaf: its path.
+        rule: the patterns of the rule that claims it.
+        operation: the name of the rule's operation.
+        shape: its shape.
+        frozen: whether the rule calls it frozen.
+        rule_number: which entry of the report's ``settings`` and ``parameters`` is the rule's.
+        columns: the numbers that there are for it: no norm for PRNG keys, none of a source that
+            was not read, no cosine to one of another shape.
+    """
 
     leaf: str
     rule: str
@@ -27,6 +38,7 @@ class Row(NamedTuple):
     shape: tuple[int, ...]
     frozen: bool
     rule_number: int
+    columns: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +51,11 @@ class Report:
         parameters: for each rule its numbers, such as ``{"omega": 0.2}``.
         norm_before: Euclidean norm of each leaf of the target, float32 [n].
         norm_after: the same of the result, float32 [n].
-        norm_source: the same of the source, float32 [n]; NaN where no source was read.
-        cosine_to_source: cosine between result and source, float32 [n]; NaN where no source was
-            read, where its shape is another, and where either is zero.
+        norm_source: the same of the source, float32 [n].
+        cosine_to_source: cosine between result and source, float32 [n]; 0 where either is zero.
 
-    For a population, or out of ``vmap``, all arrays have a leading axis P.
+    Where a number does not exist (see :class:`Row`) the array holds NaN, the records ``None`` and
+    the table a dash. For a population, or out of ``vmap``, all arrays have a leading axis P.
     """
 
     rows: tuple[Row, ...]
@@ -80,12 +92,14 @@ class Report:
                 "operation": row.operation,
                 "parameters": dict(self.settings[row.rule_number])
                 | {
-                    name: np.asarray(value).tolist()
-                    for name, value in self.parameters[row.rule_number].items()
+                    name: _floats(value) for name, value in self.parameters[row.rule_number].items()
                 },
                 "shape": row.shape,
                 "frozen": row.frozen,
-                **{name: column[..., index].tolist() for name, column in columns.items()},
+                **{
+                    name: column[..., index].tolist() if name in row.columns else None
+                    for name, column in columns.items()
+                },
             }
             for index, row in enumerate(self.rows)
         ]
@@ -134,11 +148,14 @@ jax.tree_util.register_dataclass(
 )
 
 
-def _number(value: float | list) -> str:
-    values = np.asarray(value)
-    if np.isnan(values).all():
-        return "-"
-    return f"{np.nanmean(values):.4g}"
+def _floats(array: Array) -> Any:
+    """A float32 array as Python floats that print as the float32 does: 0.2, not 0.20000000298."""
+    array = np.asarray(array)
+    return float(str(array[()])) if array.ndim == 0 else [_floats(item) for item in array]
+
+
+def _number(value: float | list | None) -> str:
+    return "-" if value is None else f"{np.mean(value):.4g}"
 
 
 def _show(value: Any) -> str:
@@ -150,7 +167,7 @@ def _show(value: Any) -> str:
     return str(value)
 
 
-def split_parameters(
+def _split_parameters(
     arguments: Mapping[str, Any], members: int | None
 ) -> tuple[dict[str, Array], tuple[tuple[str, Any], ...]]:
     """Numbers, which may be traced, apart from settings, which are static and hashable."""
@@ -203,52 +220,56 @@ def measure(
         source: the source's leaves that were read, by path.
         members: P where leaves are stacked on a leading axis.
     """
-    split = [split_parameters(values, members) for values in arguments]
-    comparable = {
-        path: leaf
-        for path, leaf in source.items()
-        if leaf.shape == after[path].shape and _is_number(leaf)
-    }
-    numbers = _norms(
-        *(_numbers(leaves) for leaves in (before, after, source)),
-        comparable,
-        population=members is not None,
-    )
+    split = [_split_parameters(values, members) for values in arguments]
+    before, after, source = map(_numbers, (before, after, source))
+    comparable = {path: x for path, x in source.items() if x.shape == after[path].shape}
+    measured = _measure(before, after, source, comparable, population=members is not None)
     missing = jnp.full(() if members is None else (members,), jnp.nan)
     columns = {
-        name: jnp.stack([numbers[name].get(row.leaf, missing) for row in rows], axis=-1)
-        for name in _COLUMNS
+        name: jnp.stack([found.get(row.leaf, missing) for row in rows], axis=-1)
+        if rows
+        else missing
+        for name, found in measured.items()
     }
+    rows = [
+        row._replace(columns=tuple(name for name in _COLUMNS if row.leaf in measured[name]))
+        for row in rows
+    ]
     return Report(
-        tuple(rows), tuple(s for _, s in split), tuple(numbers for numbers, _ in split), **columns
+        tuple(rows),
+        settings=tuple(settings for _, settings in split),
+        parameters=tuple(numbers for numbers, _ in split),
+        **columns,
     )
-
-
-def _is_number(leaf: Array) -> bool:
-    return not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _numbers(leaves: Mapping[str, Array]) -> dict[str, Array]:
-    return {path: leaf for path, leaf in leaves.items() if _is_number(leaf)}
+    """The leaves without PRNG keys."""
+    is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return {path: leaf for path, leaf in leaves.items() if not is_key(leaf)}
 
 
 # One compiled function for the whole tree: leaf by leaf, every new shape would compile anew.
 @functools.partial(jax.jit, static_argnames="population")
-def _norms(
+def _measure(
     before: PyTree, after: PyTree, source: PyTree, comparable: PyTree, *, population: bool
 ) -> dict[str, dict[str, Array]]:
     def inner(a, b):
-        a, b = a.astype(jnp.float32), b.astype(jnp.float32)
-        return jnp.sum(a * b, axis=tuple(range(1, a.ndim)) if population else None)
+        a, b = (x.astype(jnp.promote_types(x.dtype, jnp.float32)) for x in (a, b))
+        products = jnp.real(a * jnp.conj(b)).astype(jnp.float32)
+        return products.sum(axis=tuple(range(1, a.ndim)) if population else None)
 
-    norm = lambda leaves: {path: jnp.sqrt(inner(x, x)) for path, x in leaves.items()}  # noqa: E731
-    norms = {
-        "norm_before": norm(before),
-        "norm_after": norm(after),
-        "norm_source": norm(source),
+    def norms(leaves):
+        return {path: jnp.sqrt(inner(leaf, leaf)) for path, leaf in leaves.items()}
+
+    norm_after, norm_source = norms(after), norms(source)
+    cosines = {}
+    for path, leaf in comparable.items():
+        lengths = norm_after[path] * norm_source[path]
+        cosines[path] = inner(after[path], leaf) / jnp.where(lengths == 0, 1, lengths)
+    return {
+        "norm_before": norms(before),
+        "norm_after": norm_after,
+        "norm_source": norm_source,
+        "cosine_to_source": cosines,
     }
-    norms["cosine_to_source"] = {
-        path: inner(after[path], other) / (norms["norm_after"][path] * norms["norm_source"][path])
-        for path, other in comparable.items()
-    }
-    return norms

@@ -93,7 +93,7 @@ def copy(target: PyTree, source: PyTree, *, where: Where = None) -> PyTree:
     def leaf_operation(path, leaf):
         other = find(sources, path)
         check_shape(path, leaf, other)
-        return other if other.dtype == leaf.dtype else cast(path, other, leaf)
+        return cast(path, other, leaf)
 
     return _change(target, where, leaf_operation)
 
