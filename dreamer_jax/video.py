@@ -5,7 +5,9 @@ Axis letters: T frames, N videos side by side.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,7 @@ def write_video(path: str | os.PathLike, frames: np.ndarray, fps: float = 25.0) 
     Raises:
         ValueError: the frames have another shape or dtype, there are none, or the suffix is
             another.
+        OSError: the file cannot be written; with the reason.
     """
     path = Path(path)
     frames = np.asarray(frames)
@@ -78,23 +81,25 @@ def _enlarged(frame: np.ndarray, even: bool) -> np.ndarray:
 
 
 def _write_mp4(path: Path, frames: np.ndarray, fps: float) -> None:
+    # imageio's own writer forks with Python code in between, which JAX's threads can deadlock.
     import imageio_ffmpeg
 
     height, width = _enlarged(frames[0], even=True).shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (width, height),
-        fps=fps,
-        codec="libx264",
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    try:
-        for frame in frames:
-            writer.send(_enlarged(frame, even=True))
-    finally:
-        writer.close()
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
+    encoding = "-an -c:v libx264 -pix_fmt yuv420p -crf 18 -threads 1 -movflags +faststart"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    with subprocess.Popen(
+        [*command, *source.split(), *encoding.split(), str(path)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        process_group=0,  # Ctrl-C is for the run, which finishes its videos
+    ) as process:
+        with contextlib.suppress(BrokenPipeError):  # its own message is better
+            for frame in frames:
+                process.stdin.write(_enlarged(frame, even=True))
+        message = process.communicate()[1].decode(errors="replace").strip()
+    if process.returncode:
+        raise OSError(f"could not write {path}: ffmpeg says {message or process.returncode}")
 
 
 def _write_gif(path: Path, frames: np.ndarray, fps: float) -> None:
