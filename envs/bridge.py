@@ -178,17 +178,17 @@ class HostEnv:
     ) -> tuple[np.ndarray, TimeStep]:
         self._check_slots(slots)
         now = self._ticks[slots]
-        for i in np.flatnonzero(now < 0):
-            raise SimulatorError(f"{self._name(slots[i])} was stepped before it was ever reset")
-        for i in np.flatnonzero(ticks != now):
+        if (never := now < 0).any():
+            raise SimulatorError(f"{self._name(slots[never][0])} was stepped before any reset")
+        if (stale := ticks != now).any():
             raise SimulatorError(
-                f"{self._name(slots[i])} got the state of tick {ticks[i]}, but its simulator is at "
-                f"tick {now[i]}: a state can be stepped once, and each step must use the one "
-                "before's"
+                f"{self._name(slots[stale][0])} got the state of tick {ticks[stale][0]}, but its "
+                f"simulator is at tick {now[stale][0]}: a state can be stepped once, and each "
+                "step must use the one before's"
             )
-        for i in np.flatnonzero(~np.isfinite(actions).all(axis=1)):
+        if (bad := ~np.isfinite(actions).all(axis=1)).any():
             raise SimulatorError(
-                f"{self._name(slots[i])} got an action that is not finite: {actions[i]}"
+                f"{self._name(slots[bad][0])} got an action that is not finite: {actions[bad][0]}"
             )
         self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
         time_step = self._pool.step(slots, actions)

@@ -99,20 +99,24 @@ class SimulatorPool:
         layout = record_type(action_size, image_size)
         self._request_number = 0
         self._workers: list[_Worker] = []
-        self._stop = weakref.finalize(self, _stop, self._workers)
+        self._finalizer = weakref.finalize(self, _stop, self._workers)
         with _shared_file(slots * layout.itemsize) as file:
             memory = mmap.mmap(file.fileno(), slots * layout.itemsize)
             self._records = np.ndarray((slots,), layout, buffer=memory)
             for index in range(count):
                 hosted = {s: self.tasks[s] for s in range(slots) if self._worker_of[s] == index}
                 self._workers.append(_start(hosted, file.fileno()))
-                self._workers[-1].connection.send(
-                    WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
-                )
-        for failure in self._replies(range(count)):
+                # One that is dead already is noticed when its reply is waited for.
+                with suppress(ConnectionError):
+                    self._workers[-1].connection.send(
+                        WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
+                    )
+        try:
+            for error, trace in self._replies(range(count)):
+                raise pickle.loads(error) from SimulatorError(trace)
+        except BaseException:
             self.close()
-            error, trace = failure
-            raise pickle.loads(error) from SimulatorError(trace)
+            raise
 
     def reset(self, slots: np.ndarray, keys: np.ndarray) -> TimeStep:
         """Put new simulators, seeded by `keys` (uint32 [n, words]), into `slots` (int [n]).
@@ -132,7 +136,7 @@ class SimulatorPool:
         return self._request("step", slots, [None] * len(slots))
 
     def _request(self, command: str, slots: np.ndarray, arguments: list) -> TimeStep:
-        if not self._stop.alive:
+        if not self._finalizer.alive:
             raise SimulatorError("the environment was closed, make a new one")
         self._request_number += 1
         shares: dict[int, tuple[list, list]] = {}
@@ -178,7 +182,7 @@ class SimulatorPool:
 
     def close(self) -> None:
         """End the processes. Also done when the pool is collected or the program ends."""
-        self._stop()
+        self._finalizer()
 
 
 def _shared_file(size: int) -> IO[bytes]:

@@ -3,6 +3,7 @@
 P member, K task, T ticks. The simulators are fakes whose outputs are known (`fake_simulators`).
 """
 
+import gc
 import os
 import signal
 import subprocess
@@ -226,7 +227,7 @@ def test_a_state_from_before_a_reset_is_refused(population):
 def test_a_slot_that_was_never_reset_is_refused():
     with env_of(fake("Counting")) as env:
         env.step(Token(jnp.int32(0), jnp.int32(0)), jnp.zeros(2))
-        with pytest.raises(SimulatorError, match="before it was ever reset"):
+        with pytest.raises(SimulatorError, match="before any reset"):
             env.check()
 
 
@@ -380,6 +381,16 @@ def test_there_are_never_more_workers_than_slots_and_each_task_is_spread_over_th
             ]
     with env_of(fake("Counting"), workers=8) as env:
         assert len(env._pool._workers) == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")
+def test_a_simulator_that_cannot_be_imported_is_an_error_and_leaves_nothing_open():
+    files = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(3):
+        with pytest.raises(AttributeError, match="no attribute 'Missing'"):
+            HostEnv([fake("Missing")], 2, 4, 1, 2, workers=2)
+    gc.collect()
+    assert len(list(Path("/proc/self/fd").iterdir())) == files
 
 
 def test_workers_end_when_the_environment_is_closed_and_it_says_so_afterwards():
