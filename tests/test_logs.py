@@ -373,9 +373,10 @@ def test_an_mp4_shows_the_frames_enlarged_by_a_whole_factor(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["episode.mp4"]
 
 
-def test_odd_sides_are_made_even(tmp_path):
+def test_odd_sides_are_made_even_by_repeating_the_last_pixels(tmp_path):
     _, shown = read_mp4(write_video(tmp_path / "odd.mp4", frames(2, 301, 257)))
     assert shown.shape == (2, 302, 258, 3)
+    np.testing.assert_allclose(shown[1, -1, -1], 40, atol=12)
 
 
 def test_a_gif_shows_the_same_frames(tmp_path):
