@@ -385,12 +385,13 @@ def test_there_are_never_more_workers_than_slots_and_each_task_is_spread_over_th
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")
 def test_a_simulator_that_cannot_be_imported_is_an_error_and_leaves_nothing_open():
+    gc.collect()  # of what earlier tests left
     files = len(list(Path("/proc/self/fd").iterdir()))
     for _ in range(3):
         with pytest.raises(AttributeError, match="no attribute 'Missing'"):
             HostEnv([fake("Missing")], 2, 4, 1, 2, workers=2)
     gc.collect()
-    assert len(list(Path("/proc/self/fd").iterdir())) == files
+    assert len(list(Path("/proc/self/fd").iterdir())) <= files
 
 
 def test_workers_end_when_the_environment_is_closed_and_it_says_so_afterwards():
