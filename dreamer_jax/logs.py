@@ -5,8 +5,6 @@ nothing that depends on the clock, so the file of a run that was killed and resu
 the byte, as that of one that was not; clock times go to `timings.jsonl`. Numbers are written so
 that they are read back exactly. JSON has no word for numbers that are not finite: they are the
 strings "NaN", "Infinity" and "-Infinity", which `read_metrics` turns into floats again.
-
-The progress bar and the videos of a run, modules of their own, can be imported from here too.
 """
 
 from __future__ import annotations
@@ -21,10 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from dreamer_jax.files import explained
-from dreamer_jax.progress import Progress
-from dreamer_jax.video import tile, write_video
-
-__all__ = ["MetricsWriter", "Progress", "read_metrics", "tile", "write_video"]
 
 _NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _NOT_PLOTTED = {"member", "seed", "env_steps", "updates"}

@@ -21,7 +21,7 @@ import optax
 import orbax.checkpoint as ocp
 import pytest
 
-from dreamer_jax import checkpoint as checkpoint_module
+from dreamer_jax import stored_tree
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 
 
@@ -156,6 +156,13 @@ def test_the_arrays_can_be_read_with_orbax_alone(saved):
     tree = ocp.PyTreeCheckpointer().restore(path)
     kernel = run_state(2).params["encoder"]["conv_0"]["kernel"]
     np.testing.assert_array_equal(tree["params"]["encoder"]["conv_0"]["kernel"], kernel)
+
+
+@pytest.mark.parametrize("state", [{}, {"empty": jnp.zeros((0, 3)), "none": None}])
+def test_a_state_without_any_number_is_restored_too(tmp_path, state):
+    checkpointer = Checkpointer(tmp_path)
+    checkpointer.save(0, state, {})
+    assert_identical(checkpointer.restore(state)[0], state)
 
 
 # --- which are kept -------------------------------------------------------------------------------
@@ -324,7 +331,7 @@ class FullOrbax:
     ("name", "failure"), [("write_json_atomically", full_disk), ("_orbax", FullOrbax)]
 )
 def test_a_full_disk_leaves_the_earlier_checkpoints_and_says_so(folder, monkeypatch, name, failure):
-    monkeypatch.setattr(checkpoint_module, name, failure)
+    monkeypatch.setattr(stored_tree, name, failure)
     checkpointer = Checkpointer(folder)
     with pytest.raises(OSError, match="No space left .* MiB free .* are intact") as raised:
         checkpointer.save(3, run_state(3), {})

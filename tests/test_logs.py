@@ -1,18 +1,14 @@
-"""Metrics, progress and videos: exact, the same after a resume, and readable half-written."""
+"""Metrics: exact, the same after a resume, and readable half-written."""
 
 import errno
-import io
 import json
 import math
 import os
-import re
 import struct
 import subprocess
 import sys
 import textwrap
 
-import imageio.v3 as imageio
-import imageio_ffmpeg
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,8 +17,7 @@ from hypothesis import strategies as st
 from tensorboardX.proto.event_pb2 import Event
 
 from dreamer_jax import logs as logs_module
-from dreamer_jax import progress as progress_module
-from dreamer_jax.logs import MetricsWriter, Progress, read_metrics, tile, write_video
+from dreamer_jax.logs import MetricsWriter, read_metrics
 
 
 def row(env_steps=1000, member=0, **values):
@@ -249,181 +244,3 @@ def test_after_a_resume_tensorboard_hides_what_was_beyond_the_committed_rows(tmp
         e.step for e in events(tmp_path / "tensorboard" / "member_000") if e.session_log.status
     ]
     assert purges == [1001]
-
-
-# --- progress -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    class Clock:
-        now = 0.0
-
-        def monotonic(self):
-            return self.now
-
-    clock = Clock()
-    monkeypatch.setattr(progress_module, "time", clock)
-    return clock
-
-
-def test_rates_count_the_time_of_their_own_work_and_the_time_left_counts_all(clock):
-    stream = io.StringIO()
-    with Progress(4000, 40, stream=stream, interval=0, description="run") as progress:
-        for done in (1, 2):
-            progress.update(phase="collecting")
-            clock.now += 2.0
-            progress.update(env_steps=1000 * done, last_return=-838.25)
-            clock.now += 1.0  # something else
-            progress.update(phase="updating")
-            for update in range(10):
-                clock.now += 0.25
-                progress.update(updates=10 * (done - 1) + update + 1)
-        assert progress.seconds_left() == pytest.approx(11.0)
-    last = stream.getvalue().splitlines()[-1]
-    assert last == (
-        "run · updating 50% · 2,000/4,000 steps · return -838.2 · 500 steps/s · 4 updates/s"
-        " · 0:11 left"
-    )
-
-
-def test_the_time_left_of_a_resumed_run_goes_by_what_it_did_itself(clock):
-    with Progress(1000, 0, env_steps=800, stream=io.StringIO()) as progress:
-        assert progress.seconds_left() is None
-        clock.now += 10.0
-        progress.update(env_steps=900)
-        assert progress.seconds_left() == pytest.approx(10.0)
-        progress.update(env_steps=1000)
-        assert progress.seconds_left() == 0.0
-
-
-def test_where_there_is_no_terminal_plain_lines_come_now_and_then(clock):
-    stream = io.StringIO()
-    with Progress(1000, 0, stream=stream, interval=30.0) as progress:
-        for second in range(100):
-            clock.now = float(second)
-            progress.update(env_steps=second)
-        progress.message("[bold] stays as it is")
-    lines = stream.getvalue().splitlines()
-    assert len(lines) == 4 + 1 + 1  # at 0, 30, 60 and 90 seconds, the message, the end
-    assert "[bold] stays as it is" in lines
-    assert "\x1b" not in stream.getvalue() and "\r" not in stream.getvalue()
-
-
-def test_on_a_terminal_there_is_a_live_bar_that_fits_it(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "60")
-    monkeypatch.setenv("TERM", "xterm")
-
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    stream = Terminal()
-    with Progress(1000, 10, stream=stream, description="hopper") as progress:
-        progress.update(phase="collecting")
-        progress.update(env_steps=500, updates=5, last_return=3.0)
-        progress.message("a simulator was slow")
-    shown = stream.getvalue()
-    assert "hopper · collecting" in shown and "50%" in shown and "500/1,000 steps" in shown
-    assert "a simulator was slow" in shown and "\x1b[2K" in shown
-
-
-def test_a_run_without_updates_or_steps_is_no_division_by_zero():
-    with Progress(0, 0, stream=io.StringIO()) as progress:
-        progress.update(env_steps=0, updates=0)
-
-
-# --- videos ---------------------------------------------------------------------------------------
-
-
-def frames(count=6, height=32, width=48):
-    """Each frame of one grey level, with a red left half."""
-    video = np.repeat(np.arange(count, dtype=np.uint8) * 40, height * width * 3)
-    video = video.reshape(count, height, width, 3)
-    video[:, :, : width // 2] = [200, 0, 0]
-    return video
-
-
-def read_mp4(path):
-    """The frames, and what ffmpeg says of the file."""
-    command = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        "-i",
-        path,
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-",
-    ]
-    read = subprocess.run(command, capture_output=True, check=True)
-    description = read.stderr.decode()
-    width, height = map(int, re.search(r"Video: h264.* (\d+)x(\d+)", description).groups())
-    return description, np.frombuffer(read.stdout, np.uint8).reshape(-1, height, width, 3)
-
-
-def test_an_mp4_shows_the_frames_enlarged_by_a_whole_factor(tmp_path):
-    path = write_video(tmp_path / "videos" / "episode.mp4", frames(), fps=10)
-    description, shown = read_mp4(path)
-    assert "yuv420p" in description and ", 10 fps," in description
-    assert shown.shape == (6, 256, 384, 3)
-    for index in range(6):
-        np.testing.assert_allclose(shown[index, 128, 300], 40 * index, atol=12)
-        np.testing.assert_allclose(shown[index, 128, 100], [200, 0, 0], atol=25)
-    assert [file.name for file in path.parent.iterdir()] == ["episode.mp4"]
-
-
-def test_odd_sides_are_made_even_by_repeating_the_last_pixels(tmp_path):
-    _, shown = read_mp4(write_video(tmp_path / "odd.mp4", frames(2, 301, 257)))
-    assert shown.shape == (2, 302, 258, 3)
-    np.testing.assert_allclose(shown[1, -1, -1], 40, atol=12)
-
-
-def test_a_gif_shows_the_same_frames(tmp_path):
-    path = write_video(tmp_path / "episode.gif", frames(), fps=10)
-    shown = imageio.imread(path)
-    assert shown.shape == (6, 256, 384, 3)
-    assert imageio.immeta(path)["duration"] == 100
-    expected = frames().repeat(8, axis=1).repeat(8, axis=2)
-    np.testing.assert_allclose(shown.astype(int), expected, atol=8)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (np.zeros((4, 8, 8), np.uint8), r"uint8 \[4, 8, 8\], expected uint8 \[frames, height"),
-        (np.zeros((4, 8, 8, 4), np.uint8), r"uint8 \[4, 8, 8, 4\]"),
-        (np.zeros((4, 8, 8, 3), np.float32), r"float32 \[4, 8, 8, 3\]"),
-        (np.zeros((0, 8, 8, 3), np.uint8), r"uint8 \[0, 8, 8, 3\]"),
-    ],
-)
-def test_frames_that_are_no_video_are_refused(tmp_path, wrong, message):
-    with pytest.raises(ValueError, match=message):
-        write_video(tmp_path / "x.mp4", wrong)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_suffix_or_rate_that_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"'.avi', expected one of \['.gif', '.mp4'\]"):
-        write_video(tmp_path / "x.avi", frames())
-    with pytest.raises(ValueError, match="fps must be positive, got 0"):
-        write_video(tmp_path / "x.mp4", frames(), fps=0)
-
-
-def test_a_video_that_cannot_be_written_is_an_error_that_says_why_and_leaves_nothing(tmp_path):
-    (tmp_path / "x.tmp.mp4").symlink_to(tmp_path / "absent" / "x.mp4")
-    with pytest.raises(OSError, match="x.tmp.mp4: ffmpeg says .*No such file or directory"):
-        write_video(tmp_path / "x.mp4", np.concatenate([frames()] * 20))
-    assert not list(tmp_path.iterdir())
-
-
-def test_tiles_stand_side_by_side_with_a_border_between():
-    videos = np.stack([np.full((4, 5, 6, 3), level, np.uint8) for level in (10, 20, 30)])
-    tiled = tile(videos, border=2, colour=255)
-    assert tiled.shape == (4, 5, 6 * 3 + 2 * 2, 3)
-    expected = [10] * 6 + [255] * 2 + [20] * 6 + [255] * 2 + [30] * 6
-    np.testing.assert_array_equal(tiled[2, 3, :, 1], expected)
-    np.testing.assert_array_equal(tile(videos[:1]), videos[0])
-    np.testing.assert_array_equal(tile(videos, border=0)[0, 0, :, 0], np.repeat([10, 20, 30], 6))
-    with pytest.raises(ValueError, match=r"\[4, 5, 6, 3\], expected \[videos, frames"):
-        tile(videos[0])

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dreamer_jax import replay as replay_module
-from dreamer_jax.replay import Prefetcher, Replay, sample_indices
+from dreamer_jax.prefetch import Prefetcher
+from dreamer_jax.replay import Replay, sample_indices
 
 SIZE, ACTION = 8, 2
 
