@@ -205,7 +205,7 @@ def combine(*parts: PyTree) -> PyTree:
     """The tree that :func:`partition` split.
 
     Raises:
-        ValueError: two parts hold the same leaf, or none does.
+        ValueError: two parts hold the same leaf.
 
     >>> combine({"a": 1.0, "b": None}, {"a": None, "b": 2.0})
     {'a': 1.0, 'b': 2.0}
@@ -213,9 +213,9 @@ def combine(*parts: PyTree) -> PyTree:
 
     def choose(*leaves):
         there = [leaf for leaf in leaves if leaf is not None]
-        if len(there) != 1:
-            raise ValueError(f"Expected each leaf in exactly one part, found one in {len(there)}.")
-        return there[0]
+        if len(there) > 1:
+            raise ValueError(f"Expected each leaf in one part, found one in {len(there)} of them.")
+        return there[0] if there else None
 
     return jax.tree.map(choose, *parts, is_leaf=lambda leaf: leaf is None)
 

@@ -36,7 +36,8 @@ class StoredHeads:
     """Frozen heads of N source tasks: arrays only, to live in an agent's state and checkpoints.
 
     Attributes:
-        params: parameters of one head with leaves [N, ...]; zeros where ``present`` is False.
+        params: parameters of one head with leaves [N, ...]; those of the first head again where
+            ``present`` is False.
         present: bool [N], False for places that only pad N to a common size.
     """
 
@@ -59,16 +60,15 @@ def store(heads: Sequence[PyTree], *, size: int | None = None) -> StoredHeads:
     >>> stored.params["w"], stored.present
     (Array([[1., 1.],
            [2., 2.],
-           [0., 0.]], dtype=float32), Array([ True,  True, False], dtype=bool))
+           [1., 1.]], dtype=float32), Array([ True,  True, False], dtype=bool))
     """
     heads = list(heads)
     size = len(heads) if size is None else size
     if not 0 < len(heads) <= size:
         raise ValueError(f"Got {len(heads)} heads to store in {size} places.")
-    nothing = jax.tree.map(jnp.zeros_like, heads[0])
-    return StoredHeads(
-        stack(heads + [nothing] * (size - len(heads))), jnp.arange(size) < len(heads)
-    )
+    # Not zeros, at which a head may be undefined: a NaN would pass the mask in the gradient.
+    filled = heads + heads[:1] * (size - len(heads))
+    return StoredHeads(stack(filled), jnp.arange(size) < len(heads))
 
 
 def predictions(apply_head: ApplyHead, stored: StoredHeads, inputs: Any) -> Array:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from transfer.leaves import check_shape, repeat
+from transfer.leaves import repeat
 from transfer.select import PyTree, flatten, same_structure, unflatten
 
 
@@ -24,9 +24,11 @@ def stack(trees: Sequence[PyTree]) -> PyTree:
     for index, tree in enumerate(trees[1:], start=1):
         same_structure(f"tree {index}", tree, "tree 0", trees[0])
         for path, leaf in flatten(tree).items():
-            check_shape(path, first[path], leaf)
-            if leaf.dtype != first[path].dtype:
-                raise ValueError(f"{path}: {first[path].dtype} in tree 0, {leaf.dtype} in {index}.")
+            if (leaf.shape, leaf.dtype) != (first[path].shape, first[path].dtype):
+                raise ValueError(
+                    f"{path}: {first[path].dtype} {first[path].shape} in tree 0, "
+                    f"{leaf.dtype} {leaf.shape} in tree {index}; they must be equal."
+                )
     flat = [flatten(tree) for tree in trees]
     return unflatten(trees[0], {path: jnp.stack([tree[path] for tree in flat]) for path in first})
 
