@@ -112,7 +112,8 @@ class SimulatorPool:
                         WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
                     )
         try:
-            for error, trace in self._replies(range(count)):
+            if failures := self._replies(range(count)):
+                error, trace = failures[0]
                 raise pickle.loads(error) from SimulatorError(trace)
         except BaseException:
             self.close()
@@ -148,7 +149,8 @@ class SimulatorPool:
             # A process that is dead is noticed when its reply is waited for.
             with suppress(ConnectionError):
                 self._workers[index].connection.send((self._request_number, command, *share))
-        for slot, trace in self._replies(shares):
+        if failures := self._replies(shares):
+            slot, trace = failures[0]
             raise SimulatorError(
                 f"The simulator of slot {slot}, {self.tasks[slot].name}, failed:\n{trace}"
             )
