@@ -17,12 +17,14 @@ from transfer_trees import (
     floating,
     library_tree,
     like,
+    on_device,
     trees,
 )
 
 import transfer
 
-few = hypothesis.settings(max_examples=25, deadline=None)
+many = hypothesis.settings(max_examples=50, deadline=None)
+few = hypothesis.settings(max_examples=10, deadline=None)  # of what compiles for every example
 KEY = jax.random.key(0)
 
 ARITHMETIC = {
@@ -83,7 +85,7 @@ def arrays(tree):
     }
 
 
-@few
+@many
 @hypothesis.given(trees(), st.integers(0, 99))
 def test_fraction_is_linear_the_identity_at_zero_and_a_copy_onto_nothing_at_one(target, seed):
     check_laws_of_fraction(target, like(target, seed), floating(target))
@@ -95,7 +97,7 @@ def test_fraction_obeys_its_laws_on_trees_of_every_library(name):
     check_laws_of_fraction(target, like(target, 2), floating(target))
 
 
-@few
+@many
 @hypothesis.given(trees(), st.integers(0, 99), st.sampled_from(sorted(ARITHMETIC)), st.data())
 def test_structure_shape_dtype_and_all_leaves_outside_the_selection_are_kept(
     target, seed, name, data
@@ -126,6 +128,7 @@ def check_untouched(name, target, source, where):
 @few
 @hypothesis.given(trees(), st.integers(0, 99), st.sampled_from(sorted(ARITHMETIC)))
 def test_jit_equals_eager(target, seed, name):
+    target = on_device(target)
     source = like(target, seed)
     jitted = eqx.filter_jit(ARITHMETIC[name])(target, source)
     close(jitted, ARITHMETIC[name](target, source))
@@ -134,6 +137,7 @@ def test_jit_equals_eager(target, seed, name):
 @few
 @hypothesis.given(trees(), st.integers(0, 99))
 def test_vmap_over_omega_equals_a_loop(target, seed):
+    target = on_device(target)
     source = like(target, seed)
     only = lambda tree: transfer.flatten(tree)  # noqa: E731
     omegas = jnp.array([0.0, 0.25, 1.0])

@@ -37,11 +37,14 @@ def leaf(draw):
     """A random array; multiples of 1/8 below 4, so that sums and halves are exact in bfloat16."""
     shape, dtype = draw(st.sampled_from(SHAPES)), draw(st.sampled_from(DTYPES))
     values = np.random.default_rng(draw(st.integers(0, 2**16))).integers(-32, 32, shape)
-    return jnp.asarray(values / 8, dtype)
+    return np.asarray(values / 8, dtype)
 
 
 def trees():
-    """Random trees of dictionaries, lists, tuples, named tuples and dataclasses."""
+    """Random trees of dictionaries, lists, tuples, named tuples and dataclasses.
+
+    Of NumPy arrays, for which nothing is compiled; `on_device` makes JAX arrays of them.
+    """
     names = st.text("abc", min_size=1, max_size=2)
     return st.recursive(
         leaf(),
@@ -56,6 +59,11 @@ def trees():
     ).map(lambda tree: {"root": tree})
 
 
+def on_device(tree):
+    """The tree with JAX arrays in place of NumPy arrays."""
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, tree)
+
+
 def like(tree, seed):
     """Another tree of the same structure, shapes and dtypes, with other values."""
     random = np.random.default_rng(seed)
@@ -63,7 +71,8 @@ def like(tree, seed):
     def other(array):
         if not jnp.issubdtype(array.dtype, jnp.floating):
             return array
-        return jnp.asarray(random.integers(-32, 32, array.shape) / 8, array.dtype)
+        values = np.asarray(random.integers(-32, 32, array.shape) / 8, array.dtype)
+        return jnp.asarray(values) if isinstance(array, jax.Array) else values
 
     return jax.tree.map(lambda x: other(x) if hasattr(x, "dtype") else x, tree)
 
