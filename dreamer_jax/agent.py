@@ -312,8 +312,8 @@ class Agent:
 
     def _explore(self, action: jax.Array, key: jax.Array, updates: jax.Array | int) -> jax.Array:
         exploration = self.config.exploration
-        if not self.discrete and exploration.kind == "gaussian":
-            noise = exploration.noise * jax.random.normal(key, action.shape)
+        if not self.discrete and exploration.exploration_kind == "gaussian":
+            noise = exploration.exploration_noise * jax.random.normal(key, action.shape)
             return jnp.clip(action + noise, -1.0, 1.0)
         schedule = optax.linear_schedule(
             exploration.epsilon_start, exploration.epsilon_end, exploration.epsilon_decay

@@ -116,9 +116,9 @@ class LearningConfig:
 class ExplorationConfig:
     """What is added to the actor's samples while collecting."""
 
-    kind: Literal["gaussian", "epsilon_greedy"] = "gaussian"
+    exploration_kind: Literal["gaussian", "epsilon_greedy"] = "gaussian"
     """Gaussian noise (continuous actions) or epsilon-greedy (always used if discrete)."""
-    noise: float = 0.3
+    exploration_noise: float = 0.3
     """Standard deviation of the Gaussian noise, in units of the action range [-1, 1]."""
     epsilon_start: float = 0.4
     """Probability of a random action before the first update."""
@@ -147,8 +147,8 @@ class ScheduleConfig:
     checkpoint_every: int = 10_000
     """Environment steps between checkpoints."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
-    """How members of a population are mapped in an update; auto: chunks on CPU, vmap on GPU."""
-    chunk: int = 1
+    """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
+    mapping_chunk: int = 1
     """Members in a chunk."""
 
     def __post_init__(self):
@@ -157,7 +157,7 @@ class ScheduleConfig:
             f"phase_environment_steps is {self.phase_environment_steps}, which is no multiple of "
             f"the action repeat {self.action_repeat}",
         )
-        for name in ("environment_steps", "evaluate_every", "checkpoint_every", "chunk"):
+        for name in ("environment_steps", "evaluate_every", "checkpoint_every", "mapping_chunk"):
             _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
         _require(self.prefill_phases > 0, "prefill_phases must be at least 1: updates need data")
 
@@ -180,11 +180,11 @@ class Config:
 def _presets() -> dict[str, Config]:
     small = NetworkConfig(
         image_size=32,
-        encoder_depth=16,
+        encoder_depth=8,
         stochastic_size=20,
         deterministic_size=100,
         hidden_size=100,
-        head_units=200,
+        head_units=128,
     )
     tiny = NetworkConfig(
         image_size=32,
@@ -198,12 +198,19 @@ def _presets() -> dict[str, Config]:
         "thesis": Config(),
         "cpu": Config(
             network=small,
-            learning=LearningConfig(batch_size=16, sequence_length=20),
+            learning=LearningConfig(
+                batch_size=16,
+                sequence_length=20,
+                imagination_starts=128,
+                model_learning_rate=1e-3,
+                value_learning_rate=3e-4,
+                actor_learning_rate=3e-4,
+            ),
             schedule=ScheduleConfig(environment_steps=200_000),
         ),
         "demo": Config(
-            network=dataclasses.replace(small, encoder_depth=8),
-            learning=LearningConfig(batch_size=8, sequence_length=20),
+            network=small,
+            learning=LearningConfig(batch_size=8, sequence_length=20, imagination_starts=64),
             schedule=ScheduleConfig(
                 environment_steps=10_000,
                 prefill_phases=2,

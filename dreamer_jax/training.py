@@ -433,7 +433,7 @@ class Run:
                     self.sums,
                     Batch(**batch),
                     mapping=schedule.mapping,
-                    chunk=schedule.chunk,
+                    chunk=schedule.mapping_chunk,
                 )
                 # One update ahead of the device, no more: the next batch is being prepared.
                 if previous is not None:

@@ -1,0 +1,356 @@
+"""Laws of the agent's update and policy, at sizes that compile in seconds."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dreamer_jax import rssm
+from dreamer_jax.agent import Agent, Batch, map_members
+from dreamer_jax.config import preset
+
+A = 2
+CONFIG = preset("debug")
+B, L = CONFIG.learning.batch_size, CONFIG.learning.sequence_length
+random = np.random.default_rng(0)
+
+
+def batch_of(*leading, seed=0):
+    random = np.random.default_rng(seed)
+    shape = (*leading, B, L)
+    return Batch(
+        image=random.integers(0, 256, (*shape, 32, 32, 3), dtype=np.uint8),
+        action=random.uniform(-1, 1, (*shape, A)).astype(np.float32),
+        reward=random.normal(size=shape).astype(np.float32),
+        first=random.random(shape) < 0.1,
+        terminal=np.zeros(shape, bool),
+    )
+
+
+def with_settings(group, **settings):
+    return dataclasses.replace(
+        CONFIG, **{group: dataclasses.replace(getattr(CONFIG, group), **settings)}
+    )
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return Agent(CONFIG, A)
+
+
+@pytest.fixture(scope="module")
+def update(agent):
+    return jax.jit(agent.update)
+
+
+@pytest.fixture(scope="module")
+def state(agent):
+    return jax.jit(agent.init)(0)
+
+
+def test_updates_lower_the_losses_on_one_repeated_batch(update, state):
+    batch = batch_of()
+    _, before = update(state, batch)
+    for _ in range(60):
+        state, metrics = update(state, batch)
+    assert metrics["image_loss"] < 0.9 * before["image_loss"]
+    assert metrics["reward_loss"] < 0.9 * before["reward_loss"]
+
+
+def test_an_update_is_a_function_of_state_and_batch_alone(update, state):
+    chex.assert_trees_all_equal(update(state, batch_of()), update(state, batch_of()))
+
+
+def test_nothing_is_traced_twice(agent, state):
+    counted = jax.jit(chex.assert_max_traces(agent.update, n=1))
+    for seed in range(4):
+        state, _ = counted(state, batch_of(seed=seed))
+    assert state.updates == 4
+
+
+def test_agents_of_other_seeds_differ_and_of_the_same_seed_do_not(agent):
+    init = jax.jit(agent.init_params)
+    one, same, other = (init(jax.random.key(seed)) for seed in (0, 0, 1))
+    chex.assert_trees_all_equal(one, same)
+    kernels = [tree["encoder"]["conv_0"]["kernel"] for tree in (one, other)]
+    assert not jnp.allclose(*kernels)
+
+
+@pytest.mark.parametrize("mapping", ["vmap", "chunks"])
+def test_a_population_of_three_equals_three_agents_alone(agent, update, mapping):
+    states = jax.jit(jax.vmap(agent.init))(jnp.arange(3))
+    population = jax.jit(map_members(agent.update, mapping, chunk=2))
+    alone = [jax.tree.map(lambda x, p=p: x[p], states) for p in range(3)]
+    for step in range(3):
+        batches = batch_of(3, seed=step)
+        states, metrics = population(states, batches)
+        for p in range(3):
+            batch = jax.tree.map(lambda x, p=p: x[p], batches)
+            alone[p], single = update(alone[p], batch)
+            chex.assert_trees_all_close(
+                jax.tree.map(lambda x, p=p: x[p], metrics), single, rtol=1e-3, atol=1e-4
+            )
+    for p in range(3):
+        chex.assert_trees_all_close(
+            jax.tree.map(lambda x, p=p: x[p], states.params), alone[p].params, atol=2e-4
+        )
+
+
+def test_an_unknown_mapping_is_refused_with_the_choices(agent):
+    with pytest.raises(ValueError, match="auto, vmap or chunks"):
+        map_members(agent.update, "pmap")
+
+
+def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, state):
+    posterior, _, _ = agent.observe(state.params, batch_of(), jax.random.key(0))
+
+    def loss(params):
+        return agent.actor_loss({}, params, posterior, jax.random.key(1))[0]
+
+    def loss_of_actor(actor):
+        return agent.actor_loss({"actor": actor}, state.params, posterior, jax.random.key(1))[0]
+
+    # Only what is passed as trainable gets a gradient: dynamics, reward and value get none.
+    assert optax.global_norm(jax.grad(loss)(state.params)) == 0.0
+    gradient = jax.grad(loss_of_actor)(state.params["actor"])
+    assert all(jnp.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
+    # Where actions have no effect on the next state, no gradient reaches the actor.
+    params = jax.tree.map(lambda x: x, state.params)
+    params["dynamics"]["action_in"]["kernel"] *= 0.0
+    blind = jax.grad(
+        lambda actor: agent.actor_loss({"actor": actor}, params, posterior, jax.random.key(1))[0]
+    )(params["actor"])
+    assert optax.global_norm(blind) == 0.0
+
+
+def test_no_gradient_of_actor_or_value_reaches_the_world_model(agent, state):
+    def loss(image_weights):
+        params = state.params | {"encoder": image_weights}
+        posterior, _, _ = agent.observe(params, batch_of(), jax.random.key(0))
+        actor, (imagined, _) = agent.actor_loss(
+            {"actor": params["actor"]}, params, posterior, jax.random.key(1)
+        )
+        return actor + agent.value_loss({"value": params["value"]}, params, imagined)
+
+    assert optax.global_norm(jax.grad(loss)(state.params["encoder"])) == 0.0
+
+
+def test_frozen_components_do_not_move_and_cost_no_optimiser_memory(update, state):
+    frozen = Agent(with_settings("learning", frozen=("encoder", "value")), A)
+    start = jax.jit(frozen.init)(0)
+    new = start
+    step = jax.jit(frozen.update)
+    for seed in range(3):
+        new, metrics = step(new, batch_of(seed=seed))
+    for name in ("encoder", "value"):
+        chex.assert_trees_all_equal(new.params[name], start.params[name])
+    for name in ("decoder", "dynamics", "reward", "actor"):
+        moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), new.params[name], start.params[name])
+        assert max(jax.tree.leaves(moved)) > 0
+    full = sum(x.size for x in jax.tree.leaves(state.optimisers))
+    part = sum(x.size for x in jax.tree.leaves(start.optimisers))
+    saved = sum(x.size for n in ("encoder", "value") for x in jax.tree.leaves(start.params[n]))
+    assert full - part == 2 * saved
+    assert "value_gradient_norm" not in metrics
+
+
+def test_the_gradient_of_a_frozen_encoder_is_not_computed(agent, state):
+    frozen = Agent(with_settings("learning", frozen=("encoder",)), A)
+    start = jax.eval_shape(frozen.init, 0)
+
+    def cost(some, start):
+        compiled = jax.jit(some.update).lower(start, batch_of()).compile()
+        return compiled.cost_analysis()["flops"]
+
+    assert cost(frozen, start) < cost(agent, state)
+
+
+def test_a_member_whose_loss_is_not_finite_is_frozen_and_the_others_go_on(agent):
+    states = jax.jit(jax.vmap(agent.init))(jnp.arange(2))
+    step = jax.jit(map_members(agent.update, "vmap"))
+    batches = batch_of(2)
+    healthy, _ = step(states, batches)
+    batches.reward[0, 0, 0] = np.nan
+    injected, metrics = step(states, batches)
+    assert_array_equal(injected.healthy, [False, True])
+    assert not np.isfinite(metrics["reward_loss"][0])
+    member = [jax.tree.map(lambda x, p=p: x[p], injected) for p in range(2)]
+    chex.assert_trees_all_equal(
+        member[0].params, jax.tree.map(lambda x: x[0], states.params)
+    )
+    chex.assert_trees_all_close(
+        member[1].params, jax.tree.map(lambda x: x[1], healthy.params), atol=1e-6
+    )
+    # It stays frozen when its batches are sound again, and keeps in step with the others.
+    later, _ = step(injected, batch_of(2, seed=1))
+    assert_array_equal(later.healthy, [False, True])
+    assert_array_equal(later.updates, [2, 2])
+    chex.assert_trees_all_equal(
+        jax.tree.map(lambda x: x[0], (later.params, later.optimisers)),
+        jax.tree.map(lambda x: x[0], (injected.params, injected.optimisers)),
+    )
+
+
+def test_imagination_from_fewer_states_costs_less(agent):
+    fewer = Agent(with_settings("learning", imagination_starts=3), A)
+    params = jax.jit(fewer.init_params)(jax.random.key(0))
+    posterior = jax.tree.map(jnp.zeros_like, agent.dynamics.initial((B, L)))
+    _, ((features, returns, weights), _) = fewer.actor_loss(
+        {}, params, posterior, jax.random.key(0)
+    )
+    horizon = CONFIG.learning.horizon
+    assert features.shape == (horizon, 3, CONFIG.network.feature_size)
+    assert returns.shape == weights.shape == (horizon - 1, 3)
+
+
+def test_a_termination_head_learns_the_discount_and_shortens_imagined_returns():
+    agent = Agent(with_settings("network", termination=True), A)
+    state = jax.jit(agent.init)(0)
+    step = jax.jit(agent.update)
+    batch = batch_of()._replace(terminal=np.ones((B, L), bool))
+    for _ in range(150):
+        state, metrics = step(state, batch)
+    # Every record is terminal, so the learned discount falls towards zero.
+    posterior, _, _ = agent.observe(state.params, batch, jax.random.key(0))
+    discount = jax.nn.sigmoid(agent.head(state.params, "termination", posterior.features))
+    assert discount.mean() < 0.35
+    assert metrics["termination_loss"] < 0.7
+
+
+def test_discrete_actions_are_one_hot_and_their_actor_learns():
+    agent = Agent(CONFIG, 3, discrete=True)
+    state = jax.jit(agent.init)(0)
+    batch = batch_of()
+    one_hot = np.eye(3, dtype=np.float32)[random.integers(0, 3, (B, L))]
+    new, metrics = jax.jit(agent.update)(state, batch._replace(action=one_hot))
+    assert metrics["actor_gradient_norm"] > 0
+    policy = jax.jit(agent.policy, static_argnames="mode")
+    for mode in ("explore", "evaluate"):
+        for seed in range(5):
+            action, _ = policy(
+                new.params,
+                agent.initial_carry(),
+                batch.image[0, 0],
+                jnp.bool_(True),
+                jax.random.key(seed),
+                mode=mode,
+            )
+            assert sorted(action.tolist()) == [0.0, 0.0, 1.0]
+
+
+def test_epsilon_greedy_falls_from_its_start_to_its_end():
+    config = with_settings("exploration", exploration_kind="epsilon_greedy", epsilon_decay=100)
+    agent = Agent(config, 1)
+
+    @jax.jit
+    @jax.vmap
+    def explored(key, updates):
+        return agent._explore(jnp.full(1, 0.123), key, updates)[0] != jnp.float32(0.123)
+
+    keys = jax.random.split(jax.random.key(0), 4000)
+    for updates, expected in ((0, 0.4), (50, 0.25), (100, 0.1), (10_000, 0.1)):
+        share = explored(keys, jnp.full(4000, updates)).mean()
+        assert_allclose(share, expected, atol=0.03)
+
+
+def test_the_policy_forgets_across_a_first_image(agent, state):
+    image = batch_of().image[0, 0]
+    policy = jax.jit(agent.policy, static_argnames="mode")
+    fresh = agent.initial_carry()
+    other = jax.tree.map(lambda x: x + 1.0, fresh)
+    key = jax.random.key(0)
+    actions = [
+        policy(state.params, carry, image, jnp.bool_(first), key, mode="evaluate")[0]
+        for carry, first in ((fresh, True), (other, True), (other, False))
+    ]
+    assert_array_equal(actions[0], actions[1])
+    assert not jnp.allclose(actions[0], actions[2])
+
+
+def test_the_policy_acts_on_the_states_that_training_observes(agent, state):
+    # Filtering image by image and observing a whole sequence are one computation.
+    batch = batch_of()
+    sequence = jax.tree.map(lambda x: x[:1], batch)._replace(first=np.zeros((1, L), bool))
+    key = jax.random.key(0)
+    states, _, _ = agent.observe(state.params, sequence, key)
+    noise = jax.random.normal(key, (L, 1, CONFIG.network.stochastic_size))
+    carry = agent.initial_carry().state
+    variables = {"params": state.params["dynamics"]}
+    for t in range(L):
+        embedding = agent.encode(state.params, sequence.image[:, t])[0]
+        projected = agent.dynamics.apply(variables, embedding, method="project")
+        carry = agent.dynamics.apply(
+            variables,
+            carry,
+            sequence.action[0, t],
+            projected,
+            jnp.bool_(False),
+            noise[t, 0],
+            method="obs_step",
+        )
+        assert_allclose(carry.features, states.features[0, t], atol=1e-5)
+
+
+def test_exploration_stays_in_the_range_of_actions(agent, state):
+    image = batch_of().image[0, 0]
+    policy = jax.jit(jax.vmap(
+        lambda key: agent.policy(
+            state.params, agent.initial_carry(), image, jnp.bool_(True), key, "explore"
+        )[0]
+    ))
+    actions = policy(jax.random.split(jax.random.key(0), 500))
+    assert jnp.abs(actions).max() <= 1.0
+    assert actions.std() > 0.2
+
+
+def test_an_unknown_policy_mode_is_refused(agent, state):
+    with pytest.raises(ValueError, match="'explore' or 'evaluate'"):
+        agent.policy(
+            state.params, agent.initial_carry(), batch_of().image[0, 0], True, jax.random.key(0), "x"
+        )
+
+
+def test_a_batch_of_another_action_size_is_refused(agent, state):
+    batch = batch_of()
+    with pytest.raises(AssertionError):
+        agent.update(state, batch._replace(action=batch.action[..., :1]))
+
+
+def test_bfloat16_keeps_parameters_and_losses_in_float32_and_close(state):
+    agent = Agent(with_settings("network", precision="bfloat16"), A)
+    new, metrics = jax.jit(agent.update)(state, batch_of())
+    assert {x.dtype for x in jax.tree.leaves(new.params)} == {jnp.dtype("float32")}
+    assert {x.dtype for x in metrics.values()} == {jnp.dtype("float32")}
+    _, exact = jax.jit(Agent(CONFIG, A).update)(state, batch_of())
+    assert_allclose(metrics["model_loss"], exact["model_loss"], rtol=0.02)
+    assert_allclose(metrics["value_loss"], exact["value_loss"], rtol=0.3, atol=0.05)
+
+
+def test_predictions_see_the_context_and_nothing_of_what_follows(agent, state):
+    batch = batch_of()._replace(first=np.zeros((B, L), bool))
+    changed = batch._replace(image=batch.image.copy())
+    changed.image[:, 3:] = 0
+    key = jax.random.key(0)
+    truth, one = agent.predict(state.params, batch, 3, key)
+    _, two = agent.predict(state.params, changed, 3, key)
+    assert_array_equal(one, two)
+    assert_allclose(truth, batch.image / 255.0, atol=1e-6)
+    assert one.shape == truth.shape
+
+
+def test_a_seeds_initial_parameters_do_not_depend_on_options():
+    plain = jax.jit(Agent(CONFIG, A).init_params)(jax.random.key(0))
+    option = Agent(with_settings("network", termination=True), A)
+    extended = jax.jit(option.init_params)(jax.random.key(0))
+    chex.assert_trees_all_equal(plain, {name: extended[name] for name in plain})
+
+
+def test_latent_features_are_the_sample_and_the_deterministic_part():
+    zeros, ones = jnp.zeros(2), jnp.ones(3)
+    state = rssm.LatentState(zeros + 7, zeros + 8, zeros, ones)
+    assert_array_equal(state.features, [0, 0, 1, 1, 1])

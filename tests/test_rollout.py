@@ -1,0 +1,112 @@
+"""Phases: records, keys and episodes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dreamer_jax.agent import Agent
+from dreamer_jax.config import preset
+from dreamer_jax.rollout import Records, collect, episodes, phase_key, rollout
+from tests.probes import Probe
+
+T = 30
+
+
+def random_policy(carry, image, first, key):
+    return jax.random.uniform(key, (2,), minval=-1, maxval=1), carry
+
+
+def run(slot=0, seed=0):
+    records = rollout(Probe(), random_policy, (), jnp.int32(slot), jax.random.key(seed), T)
+    return jax.tree.map(np.asarray, records)
+
+
+def test_a_phase_has_one_record_more_than_ticks():
+    records = run()
+    assert records.image.shape == (T + 1, 32, 32, 3)
+    assert records.action.shape == (T + 1, 2)
+
+
+def test_a_reset_record_has_zero_action_and_reward():
+    records = run()
+    assert records.first[0]
+    assert records.first.sum() > 2
+    assert_array_equal(records.action[records.first], 0.0)
+    assert_array_equal(records.reward[records.first], 0.0)
+
+
+def test_a_terminal_record_is_kept_and_followed_by_a_reset():
+    records = run()
+    ends = np.flatnonzero(records.terminal[:-1])
+    assert ends.size
+    assert records.first[ends + 1].all()
+    assert not records.first[ends].any()
+
+
+def test_a_record_holds_the_action_that_led_to_its_image():
+    records = run()
+
+    def column(image):
+        return np.argmax(image[0, :, 0]) / 32 * 2 - 1
+
+    for t in range(1, T + 1):
+        if not records.first[t]:
+            moved = column(records.image[t]) - column(records.image[t - 1])
+            assert_allclose(moved, 0.1 * records.action[t, 0], atol=2 / 32)
+            assert_allclose(records.reward[t], 1 - 4 * (records.action[t, 0] - 0.5) ** 2, rtol=1e-5)
+
+
+def test_episodes_add_up_to_the_phase():
+    records = run()
+    found = episodes(records)
+    assert sum(episode.length + 1 for episode in found) == T + 1
+    assert_allclose(sum(episode.score for episode in found), records.reward.sum(), rtol=1e-5)
+    assert [episode.fell for episode in found[:-1]] == [True] * (len(found) - 1)
+
+
+def test_episodes_by_hand():
+    records = Records(
+        image=None,
+        action=None,
+        reward=np.array([0, 1, 2, 0, 3, 4], np.float32),
+        first=np.array([1, 0, 0, 1, 0, 0], bool),
+        terminal=np.array([0, 0, 1, 0, 0, 0], bool),
+    )
+    assert episodes(records) == [(0, 2, 3.0, True), (3, 2, 7.0, False)]
+
+
+def test_keys_of_phases_differ_by_member_task_kind_and_phase():
+    keys = {
+        tuple(jax.random.key_data(phase_key(seed, task, kind, phase)).tolist())
+        for seed in range(3)
+        for task in range(2)
+        for kind in ("explore", "evaluate")
+        for phase in range(3)
+    }
+    assert len(keys) == 3 * 2 * 2 * 3
+
+
+def collected(seeds, kind="random", phase=0, tasks=2):
+    agent = Agent(preset("debug"), 2)
+    seeds = jnp.array(seeds, jnp.int32)
+    params = jax.jit(jax.vmap(agent.init_params))(jax.vmap(jax.random.key)(seeds))
+    env = Probe()
+    records = collect(
+        agent, env, params, seeds, seeds * 0, jnp.int32(phase), tasks=tasks, ticks=T, kind=kind
+    )
+    return jax.tree.map(np.asarray, records)
+
+
+def test_members_and_tasks_collect_side_by_side():
+    records = collected([0, 1, 2])
+    assert records.image.shape == (3, 2, T + 1, 32, 32, 3)
+    flat = records.action.reshape(6, -1)
+    assert len(np.unique(flat, axis=0)) == 6
+
+
+def test_a_policy_collects_the_same_again_and_other_things_in_another_phase():
+    one, again, other = (collected([0], "explore", phase) for phase in (3, 3, 4))
+    for a, b in zip(one, again, strict=True):
+        assert_array_equal(a, b)
+    assert (one.action != other.action).any()
