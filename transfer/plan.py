@@ -231,35 +231,31 @@ def apply(
         mine = [path for path in before if claimed[path] is rule]
         signature = _signature(rule, operations)
         arguments.append(_arguments(rule, signature, parameters))
-        inputs = []
-        if "source" in signature or "sources" in signature:
-            trees = [
-                _repeat_shared(flatten(tree), before, members) if population else flatten(tree)
-                for tree in _sources(plan, rule, source, several="sources" in signature)
-            ]
-            inputs = [trees] if "sources" in signature else trees
-        if "source" in signature:
-            read |= {path: inputs[0][path] for path in mine if path in inputs[0]}
-        keywords = arguments[-1]
+        trees = _sources(plan, rule, signature, source)
+        if population:
+            trees = [_repeat_shared(tree, before, mine, members) for tree in trees]
+        several = "sources" in signature
+        inputs = [trees] if several else trees
+        if trees and not several:
+            read |= {path: trees[0][path] for path in mine if path in trees[0]}
+        keywords = dict(arguments[-1])
         if "key" in signature:
             if key is None:
                 raise ValueError(f"The rule '{rule}' draws random numbers; give apply a key.")
-            keywords = keywords | {"key": key}
+            keywords |= {"key": key}
         where = mask_of(result, mine)
         result = operations[rule.operation](result, *inputs, where=where, **keywords)
     _check_all_used(plan, rules, arguments, parameters)
-    numbers = {id(rule): number for number, rule in enumerate(rules)}
     rows = [
         Row(
-            path,
-            ", ".join(rule.patterns),
-            rule.operation,
-            leaf.shape,
-            rule.frozen,
-            numbers[id(rule)],
+            leaf=path,
+            rule=", ".join(claimed[path].patterns),
+            operation=claimed[path].operation,
+            shape=leaf.shape,
+            frozen=claimed[path].frozen,
+            rule_number=next(n for n, rule in enumerate(rules) if rule is claimed[path]),
         )
         for path, leaf in before.items()
-        for rule in [claimed[path]]
     ]
     return result, measure(rows, arguments, before, flatten(result), read, members=members)
 
@@ -312,8 +308,13 @@ def _check_all_used(
         )
 
 
-def _sources(plan: Plan, rule: Rule, source: PyTree, *, several: bool) -> list[PyTree]:
-    """The trees that a rule reads."""
+def _sources(
+    plan: Plan, rule: Rule, signature: Mapping[str, inspect.Parameter], source: PyTree
+) -> list[dict[str, Any]]:
+    """The trees that a rule reads, flat: none, one, or as many as it names."""
+    several = "sources" in signature
+    if not several and "source" not in signature:
+        return []
     if source is None:
         raise ValueError(f"The rule '{rule}' reads a source; give apply one.")
     if not any(other.source is not None for other in plan.rules):
@@ -322,7 +323,7 @@ def _sources(plan: Plan, rule: Rule, source: PyTree, *, several: bool) -> list[P
                 f"The rule '{rule}' reads several sources; name them in the rule, as in "
                 "source=('first', 'second'), and give apply {name: tree}."
             )
-        return [source]
+        return [flatten(source)]
     if not isinstance(source, Mapping):
         raise ValueError(
             f"Rules of the plan name their sources; give apply {{name: tree}}, "
@@ -339,14 +340,15 @@ def _sources(plan: Plan, rule: Rule, source: PyTree, *, several: bool) -> list[P
             raise ValueError(
                 f"The rule '{rule}' reads the source {name!r}; given are {', '.join(source)}."
             )
-    return [source[name] for name in names]
+    return [flatten(source[name]) for name in names]
 
 
-def _repeat_shared(source: dict, target: dict, members: int) -> dict[str, Any]:
-    """Leaves with one axis less than the target's are shared by all members."""
-    return {
-        path: repeat(leaf, members)
-        if path in target and leaf.ndim == target[path].ndim - 1
-        else leaf
-        for path, leaf in source.items()
-    }
+def _repeat_shared(source: dict, target: dict, names: list[str], members: int) -> dict[str, Any]:
+    """The source with those named leaves repeated that all members share.
+
+    They are the ones with one axis less than the target's.
+    """
+    shared = [
+        path for path in names if path in source and source[path].ndim == target[path].ndim - 1
+    ]
+    return source | {path: repeat(source[path], members) for path in shared}
