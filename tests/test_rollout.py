@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import Records, collect, episodes, phase_key, rollout
-from tests.probes import Probe
+from probes import Probe
 
 T = 30
 

@@ -1,0 +1,33 @@
+"""Which package may import which."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+LIBRARIES = ("dreamer_jax", "transfer", "envs")
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module.split(".")[0]
+
+
+@pytest.mark.parametrize("package", LIBRARIES)
+def test_the_three_libraries_never_import_one_another(package):
+    forbidden = set(LIBRARIES) - {package} | {"experiments"}
+    files = sorted((ROOT / package).glob("**/*.py"))
+    assert files
+    found = {path.name: set(imported(path)) & forbidden for path in files}
+    assert {name: names for name, names in found.items() if names} == {}
+
+
+def test_experiments_imports_all_three():
+    names = set()
+    for path in (ROOT / "experiments").glob("*.py"):
+        names |= set(imported(path))
+    assert names >= set(LIBRARIES)

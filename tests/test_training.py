@@ -1,0 +1,298 @@
+"""The schedule, and runs that are stopped, killed, resumed or broken."""
+
+import dataclasses
+import json
+import signal
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import BrokenProbe, Probe
+
+from dreamer_jax import config as configs
+from dreamer_jax import training
+from dreamer_jax.agent import Agent
+from dreamer_jax.config import preset
+from dreamer_jax.logs import read_metrics
+from dreamer_jax.training import Counters, Member, NonFiniteError, Run, Schedule
+
+CONFIG = preset("debug")
+# Shared, so that all runs of these tests share their compiled functions.
+AGENT, ENV = Agent(CONFIG, 2), Probe()
+MEMBERS = (Member(0, "one"), Member(7, "two", {"omega": 0.2}))
+
+
+def run_in(directory, **options):
+    options = {"videos": 0, **options}
+    return Run(options.pop("agent", AGENT), options.pop("env", ENV), ("probe/point",),
+               options.pop("members", MEMBERS), directory, **options)  # fmt: skip
+
+
+def trained(directory, **options):
+    run = run_in(directory, **options)
+    outcome = run.train()
+    run.close()
+    return run, outcome
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("finished")
+    run, outcome = trained(directory, videos=2)
+    assert outcome == "finished"
+    return directory, run
+
+
+def test_the_schedule_of_the_thesis_for_one_task():
+    schedule = Schedule(preset("thesis").schedule, tasks=1)
+    assert schedule.prefill_rounds == 5
+    assert schedule.rounds == 1000
+    assert schedule.evaluations == 100
+    # 100 updates before each of 995 phases, and after the last.
+    assert schedule.updates == 99_600
+    assert preset("thesis").schedule.phase_ticks == 500
+
+
+def test_the_schedule_of_the_thesis_for_several_tasks():
+    schedule = Schedule(preset("thesis").schedule, tasks=4)
+    assert schedule.prefill_rounds == 1
+    assert schedule.environment_steps(1) == 4000
+    assert schedule.updates_due(1) == 400
+    assert schedule.rounds == 250
+
+
+def test_actions_follow_in_the_order_of_algorithm_3():
+    schedule = Schedule(dataclasses.replace(CONFIG.schedule, evaluate_every=80), tasks=1)
+    done, order = Counters(), []
+    while (action := schedule.next(done)) != "done":
+        order.append(action[0])
+        steps = schedule.environment_steps(done.rounds)
+        change = {
+            "update": {"updates": done.updates + 1},
+            "evaluate": {"evaluations": steps // 80},
+        }.get(action, {"rounds": done.rounds + 1})
+        done = dataclasses.replace(done, **change)
+    assert "".join(order) == "p" + "uu" + "c" + "uue" + "c" + "uu" + "c" + "uue"
+    assert done.updates == schedule.updates
+
+
+def test_a_run_writes_a_row_for_every_member_and_event(finished):
+    directory, _ = finished
+    rows = read_metrics(directory)
+    counts = {}
+    for row in rows:
+        counts[row["kind"], row["member"]] = counts.get((row["kind"], row["member"]), 0) + 1
+    for member in range(2):
+        assert counts["collect", member] == 4
+        assert counts["update", member] == 4
+        assert counts["evaluation", member] == 4
+    assert {row["seed"] for row in rows} == {0, 7}
+    assert {row.get("omega") for row in rows if row["label"] == "two"} == {0.2}
+    assert [row["policy"] for row in rows if row["kind"] == "collect"][:3] == [
+        "random", "random", "explore",
+    ]  # fmt: skip
+    last = [row for row in rows if row["kind"] == "evaluation"][-1]
+    assert (last["env_steps"], last["updates"]) == (160, 8)
+
+
+def test_a_run_fills_its_replay_and_writes_videos(finished):
+    directory, run = finished
+    np.testing.assert_array_equal(run.replay.lengths, np.full((2, 1), 4 * 21))
+    assert len(list((directory / "videos").glob("evaluation_*.mp4"))) == 2
+
+
+def test_updates_are_not_compiled_again_after_the_first(finished):
+    assert training.update_members._cache_size() <= 2
+    before = training.update_members._cache_size()
+    _, run = finished
+    learning = CONFIG.learning
+    batch = run.replay.sample([0, 7], 0, learning.batch_size, learning.sequence_length)
+    state = jax.tree.map(jnp.copy, run.state)
+    sums = jax.tree.map(jnp.copy, run.sums)
+    training.update_members(
+        AGENT, state, sums, training.Batch(**batch), mapping="auto", chunk=1
+    )
+    assert training.update_members._cache_size() == before
+
+
+def test_members_of_one_population_do_not_influence_one_another(finished, tmp_path):
+    directory, _ = finished
+    trained(tmp_path, members=MEMBERS[1:])
+    both = [row for row in read_metrics(directory) if row["member"] == 1]
+    alone = read_metrics(tmp_path)
+    assert len(both) == len(alone)
+    for one, other in zip(both, alone, strict=True):
+        assert list(one) == list(other)
+        for name in set(one) - {"member"}:
+            expected = other[name]
+            if isinstance(expected, float):
+                expected = pytest.approx(expected, rel=1e-2, abs=1e-2)
+            assert one[name] == expected, name
+
+
+def stop_after(run, actions):
+    """Lets a run do some actions, then stop as a Ctrl-C in the midst of updates would."""
+    original, left = training.update_members, [actions]
+
+    def counting(*arguments, **options):
+        left[0] -= 1
+        if left[0] == 0:
+            signal.raise_signal(signal.SIGINT)
+        return original(*arguments, **options)
+
+    training.update_members = counting
+    try:
+        return run.train()
+    finally:
+        training.update_members = original
+        run.close()
+
+
+@pytest.mark.parametrize("updates", [1, 2, 5])
+def test_a_run_stopped_by_ctrl_c_and_resumed_equals_one_that_was_not(finished, tmp_path, updates):
+    directory, whole = finished
+    run = run_in(tmp_path)
+    assert stop_after(run, updates) == "stopped"
+    assert run.counters.updates == updates
+    resumed, outcome = trained(tmp_path, resume=True)
+    assert outcome == "finished"
+    metrics = [(folder / "metrics.jsonl").read_bytes() for folder in (directory, tmp_path)]
+    assert metrics[0] == metrics[1]
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+class Killed(BaseException):
+    """Stands for what ends a process without letting it save."""
+
+
+@pytest.mark.parametrize("updates", [1, 4, 7])
+def test_a_run_killed_between_checkpoints_and_resumed_equals_one_that_was_not(
+    finished, tmp_path, updates, monkeypatch
+):
+    directory, whole = finished
+    original, left = training.update_members, [updates]
+
+    def killing(*arguments, **options):
+        left[0] -= 1
+        if left[0] < 0:
+            raise Killed
+        return original(*arguments, **options)
+
+    run = run_in(tmp_path)
+    monkeypatch.setattr(training, "update_members", killing)
+    with pytest.raises(Killed):
+        run.train()
+    run.close()
+    monkeypatch.undo()
+    resumed, _ = trained(tmp_path, resume=True)
+    metrics = [(folder / "metrics.jsonl").read_bytes() for folder in (directory, tmp_path)]
+    assert metrics[0] == metrics[1]
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_finished_run_that_is_resumed_changes_nothing(finished):
+    directory, whole = finished
+    before = (directory / "metrics.jsonl").read_bytes()
+    resumed, outcome = trained(directory, resume=True)
+    assert outcome == "finished"
+    assert (directory / "metrics.jsonl").read_bytes() == before
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(finished):
+    with pytest.raises(FileExistsError, match="resume it, or choose another folder"):
+        run_in(finished[0])
+
+
+def test_a_simulator_that_dies_ends_the_run_with_everything_before_it_saved(finished, tmp_path):
+    directory, whole = finished
+    run = run_in(tmp_path, env=BrokenProbe(phases=3))
+    with pytest.raises(RuntimeError, match="probe/point died"):
+        run.train()
+    run.close()
+    assert run.counters.updates == 4
+    resumed, _ = trained(tmp_path, resume=True)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == (directory / "metrics.jsonl").read_bytes()
+
+
+def test_a_member_that_turns_not_finite_is_named_and_the_others_finish(tmp_path, capsys):
+    run = run_in(tmp_path)
+    poisoned = run.state.params["reward"]["out"]["bias"].at[1].set(jnp.nan)
+    run.state.params["reward"]["out"]["bias"] = poisoned
+    assert run.train() == "finished"
+    run.close()
+    assert "member 1 (two, seed 7)" in capsys.readouterr().out
+    rows = [row for row in read_metrics(tmp_path) if row["kind"] == "update"]
+    assert [row["healthy"] for row in rows if row["member"] == 0] == [True] * 4
+    assert [row["healthy"] for row in rows if row["member"] == 1] == [False] * 4
+
+
+def test_a_run_without_a_healthy_member_ends_with_a_clear_error(tmp_path):
+    run = run_in(tmp_path, members=MEMBERS[:1])
+    run.state.params["reward"]["out"]["bias"] *= jnp.nan
+    with pytest.raises(NonFiniteError, match="no member of .* finite"):
+        run.train()
+    run.close()
+
+
+def test_an_environment_of_other_sizes_is_refused_naming_both(tmp_path):
+    with pytest.raises(ValueError, match="size 3, the agent gives 2"):
+        run_in(tmp_path, env=Probe(action_size=3))
+    with pytest.raises(ValueError, match="renders 64 pixels, the agent reads 32"):
+        run_in(tmp_path, env=Probe(image_size=64))
+
+
+def test_the_probe_is_solved_in_seconds(tmp_path):
+    # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
+    config = dataclasses.replace(
+        CONFIG,
+        network=dataclasses.replace(CONFIG.network, head_units=32, hidden_size=32),
+        learning=dataclasses.replace(
+            CONFIG.learning,
+            batch_size=8,
+            sequence_length=8,
+            horizon=5,
+            discount=0.5,
+            model_learning_rate=3e-3,
+            value_learning_rate=1e-3,
+            actor_learning_rate=1e-3,
+        ),
+        schedule=dataclasses.replace(
+            CONFIG.schedule,
+            environment_steps=2000,
+            phase_environment_steps=100,
+            updates_per_phase=60,
+            evaluate_every=2000,
+            checkpoint_every=2000,
+        ),
+    )
+    agent, env = Agent(config, 2), Probe(falls=False)
+    trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
+    score = [row for row in read_metrics(tmp_path) if row["kind"] == "evaluation"][-1]["return"]
+    assert score > 0.8 * config.schedule.phase_ticks
+
+
+def test_a_configuration_survives_json():
+    config = dataclasses.replace(
+        CONFIG, learning=dataclasses.replace(CONFIG.learning, frozen=("encoder",))
+    )
+    assert configs.from_dict(json.loads(json.dumps(configs.to_dict(config)))) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda: preset("thsis"), "did you mean 'thesis'"),
+        (lambda: configs.NetworkConfig(image_size=48), "32 or 64"),
+        (lambda: configs.LearningConfig(frozen=("encodr",)), "components are encoder"),
+        (lambda: configs.LearningConfig(horizon=1), "at least 2"),
+        (lambda: configs.LearningConfig(imagination_starts=0), "2500 posterior states"),
+        (lambda: configs.ScheduleConfig(phase_environment_steps=5), "no multiple"),
+        (lambda: configs.from_dict({"network": {"image": 32}}), "unknown settings"),
+    ],
+)
+def test_bad_settings_are_refused_with_a_way_out(change, message):
+    with pytest.raises(ValueError, match=message):
+        change()
