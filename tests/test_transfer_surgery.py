@@ -291,6 +291,19 @@ def test_members_of_a_population_are_reinitialised_each_with_its_own_key():
         transfer.reinitialise(population, initializer="zeros", key=keys[:2])
 
 
+@many
+@hypothesis.given(trees(), st.integers(0, 99))
+def test_interpolate_goes_from_the_target_to_the_source(target, seed):
+    source = like(target, seed)
+    at = lambda weight: transfer.interpolate(target, source, weight=weight)  # noqa: E731
+    close(at(0.0), target)
+    close(at(1.0), source)
+    # A quarter of the way: 3/4 target + 1/4 source, exact in multiples of 1/32 below 4.
+    for path, leaf in transfer.flatten(at(0.25)).items():
+        mine, theirs = (np.asarray(transfer.flatten(t)[path], np.float32) for t in (target, source))
+        np.testing.assert_array_equal(leaf, (0.75 * mine + 0.25 * theirs).astype(leaf.dtype))
+
+
 def test_shrink_perturb_shrinks_and_adds_noise_of_the_given_size():
     source = {"w": jnp.full((200, 200), 3.0)}
     new = transfer.shrink_perturb(source, source, shrink=0.5, noise=0.1, key=KEY)["w"]
