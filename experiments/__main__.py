@@ -1,15 +1,21 @@
 """The command line: python -m experiments {train, evaluate, report, demo}."""
 
+import contextlib
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import jax
 import tyro
 
 from dreamer_jax import config as configs
+from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.config import Config
+from dreamer_jax.training import NonFiniteError
+from envs import SimulatorError
 
 FAILURE, USAGE, STOPPED = 1, 2, 130
 
@@ -87,6 +93,19 @@ Command = (
 )
 
 
+class UsageError(Exception):
+    """Bad input, with a message that names the way out."""
+
+
+@contextlib.contextmanager
+def usage_errors():
+    """What is raised while input is read and checked is the user's to mend."""
+    try:
+        yield
+    except (ValueError, FileExistsError, ModuleNotFoundError) as error:
+        raise UsageError(str(error)) from error
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command.
 
@@ -95,15 +114,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        command = _parse(arguments)
+        with usage_errors():
+            command = _parse(arguments)
+        _keep_compiled_functions()
         run = {Train: _train, Evaluate: _evaluate, Report: _report, Demo: _demo}[type(command)]
         return run(command)
-    except (ValueError, FileExistsError, ModuleNotFoundError) as error:
+    except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return USAGE
+    except (OSError, SimulatorError, NonFiniteError, CorruptCheckpointError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return FAILURE
     except KeyboardInterrupt:
         print("stopped without saving; what was saved before can be resumed", file=sys.stderr)
         return STOPPED
+
+
+def _keep_compiled_functions() -> None:
+    """Keeps compiled functions on disk, so that the second start of a run takes seconds.
+
+    JAX's own settings (JAX_COMPILATION_CACHE_DIR and the like) take precedence.
+    """
+    if not jax.config.jax_compilation_cache_dir:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "dreamer-transfer" / "jax"))
 
 
 def _parse(arguments: list[str]):
@@ -127,43 +161,33 @@ def _parse(arguments: list[str]):
 
 
 def _train(command: Train) -> int:
-    from experiments.run import RunSpec, make_run
+    from experiments.run import RunSpec, carry_out, make_run
 
-    spec = RunSpec(
-        tasks=command.task,
-        seeds=command.seeds,
-        config=command.config,
-        source=None if command.source is None else str(command.source),
-        source_member=command.source_member,
-        omegas=command.omega,
-        baseline=command.baseline,
-    )
-    run = make_run(spec, command.out, resume=command.resume, workers=command.workers)
+    with usage_errors():
+        spec = RunSpec(
+            tasks=command.task,
+            seeds=command.seeds,
+            config=command.config,
+            source=None if command.source is None else str(command.source),
+            source_member=command.source_member,
+            omegas=command.omega,
+            baseline=command.baseline,
+        )
+        run = make_run(spec, command.out, resume=command.resume, workers=command.workers)
     if spec.source is not None:
         print((command.out / "transfer.txt").read_text())
-    return _finish(command.out, run)
-
-
-def _finish(directory: Path, run) -> int:
-    """Trains to the end or to Ctrl-C, and shows what came of it."""
-    try:
-        outcome = run.train()
-    except ValueError as error:
-        # Bad input was found before: what is raised here is no usage error.
-        raise RuntimeError(str(error)) from error
-    finally:
-        run.close()
-        run.env.close()
-    if outcome == "stopped":
-        print(f"stopped and saved in {directory}: the same command with --resume continues")
+    if carry_out(run) == "stopped":
+        print(f"stopped and saved in {command.out}: the same command with --resume continues")
         return STOPPED
-    return _report(Report(directory))
+    return _report(Report(command.out))
 
 
 def _report(command: Report) -> int:
     from experiments import report
 
-    print(report.table(report.summarise(command.directory)))
+    with usage_errors():
+        summaries = report.summarise(command.directory)
+    print(report.table(summaries))
     if report.evaluations(command.directory):
         picture, _ = report.plot_curves(command.directory)
         print(f"learning curves: {picture}")
@@ -175,15 +199,17 @@ def _evaluate(command: Evaluate) -> int:
     from rich.progress import Progress
 
     from dreamer_jax.files import write_json_atomically
-    from experiments.evaluate import evaluate
+    from experiments.evaluate import evaluate, load_agents
     from experiments.report import aligned
 
     if command.episodes < 1:
-        raise ValueError(f"--episodes is {command.episodes}, must be at least 1")
+        raise UsageError(f"--episodes is {command.episodes}, must be at least 1")
+    with usage_errors():
+        agents = load_agents(command.directory)
     with Progress() as bar:
         job = bar.add_task("evaluating", total=command.episodes)
         rows = evaluate(
-            command.directory,
+            agents,
             command.episodes,
             video=command.video,
             workers=command.workers,
@@ -218,13 +244,17 @@ def _evaluate(command: Evaluate) -> int:
 
 def _demo(command: Demo) -> int:
     from experiments import demo, evaluate, report
+    from experiments.run import carry_out, make_run
 
     config = configs.preset(command.preset)
-    if demo.run(command.out, config, workers=command.workers) == "stopped":
-        print(f"stopped and saved in {command.out}: the same command continues")
-        return STOPPED
+    for name, spec in demo.specs(command.out, config).items():
+        with usage_errors():
+            run = make_run(spec, command.out / name, resume=True, workers=command.workers)
+        if carry_out(run) == "stopped":
+            print(f"stopped and saved in {command.out}: the same command continues")
+            return STOPPED
     targets = command.out / "targets"
-    evaluate.evaluate(targets, 1, video=True, workers=command.workers)
+    evaluate.evaluate(evaluate.load_agents(targets), 1, video=True, workers=command.workers)
     pictures = report.plot_curves(targets)
     print("\nWhat was transferred, leaf by leaf (norms are means over the targets)\n")
     print((targets / "transfer.txt").read_text())

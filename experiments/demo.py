@@ -8,10 +8,9 @@ eight targets are one mapped population.
 import dataclasses
 from pathlib import Path
 
-from dreamer_jax import config as configs
 from dreamer_jax.config import Config
 from dreamer_jax.training import Schedule
-from experiments.run import RunSpec, train
+from experiments.run import RunSpec
 
 SOURCE_TASKS = ("bullet/inverted_double_pendulum", "bullet/halfcheetah")
 TARGET_TASK = "bullet/inverted_pendulum"
@@ -19,12 +18,11 @@ OMEGAS = (0.0, 0.2, 0.4)
 SEEDS = (0, 1)
 
 
-def specs(directory: Path, config: Config | None = None) -> dict[str, RunSpec]:
-    """The demo's two runs, by the name of their folder in `directory`.
+def specs(directory: Path, config: Config) -> dict[str, RunSpec]:
+    """The demo's two runs in their order, by the name of their folder in `directory`.
 
     The source collects from two tasks and so makes its phases in twice the environment steps.
     """
-    config = configs.preset("demo") if config is None else config
     steps = config.schedule.environment_steps
     longer = dataclasses.replace(config.schedule, environment_steps=len(SOURCE_TASKS) * steps)
     return {
@@ -38,24 +36,6 @@ def specs(directory: Path, config: Config | None = None) -> dict[str, RunSpec]:
             baseline=True,
         ),
     }
-
-
-def run(directory: str | Path, config: Config | None = None, workers: int | None = None) -> str:
-    """Runs what is missing of the demo.
-
-    Args:
-      directory: gets one results folder for the source and one for the targets.
-      config: other settings than those of the preset "demo".
-      workers: simulator processes; by default one per core.
-
-    Returns:
-      "finished" or "stopped".
-    """
-    directory = Path(directory)
-    for name, spec in specs(directory, config).items():
-        if train(spec, directory / name, resume=True, workers=workers) == "stopped":
-            return "stopped"
-    return "finished"
 
 
 def scale(config: Config) -> str:

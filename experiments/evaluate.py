@@ -5,7 +5,7 @@ Axis letters: P population member, K task, T records, L frames of a prediction.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,32 @@ PREDICTED_FRAMES = 60
 SHOWN_MEMBERS = 8
 
 
+class Agents(NamedTuple):
+    """The trained population of a results folder.
+
+    Attributes:
+      directory: the results folder.
+      spec: what it is a run of.
+      params: leaves [P, ...], from its newest checkpoint.
+    """
+
+    directory: Path
+    spec: RunSpec
+    params: Any
+
+
+def load_agents(directory: str | Path) -> Agents:
+    """Reads a trained population.
+
+    Raises:
+      ValueError: the folder holds no run or no checkpoint.
+    """
+    spec = read_spec(directory)
+    return Agents(Path(directory), spec, jax.tree.map(jnp.asarray, load_params(directory)))
+
+
 def evaluate(
-    directory: str | Path,
+    agents: Agents,
     count: int,
     *,
     video: bool = False,
@@ -34,7 +58,7 @@ def evaluate(
     """Plays episodes with every member of a run: the mode, without noise, up to the first fall.
 
     Args:
-      directory: a results folder.
+      agents: the population.
       count: episodes per member and task.
       video: whether to write videos/evaluate_TASK.mp4 and videos/prediction_TASK.mp4.
       workers: simulator processes; by default one per core.
@@ -43,12 +67,8 @@ def evaluate(
     Returns:
       One row per member, task and episode: member, seed, label, task, episode, return, length,
       fell.
-
-    Raises:
-      ValueError: the folder holds no run or no checkpoint.
     """
-    spec = read_spec(directory)
-    params = jax.tree.map(jnp.asarray, load_params(directory))
+    directory, spec, params = agents
     agent, env = make_agent(spec), make_env(spec, workers)
     seeds = jnp.array([member.seed for member in spec.members], jnp.int32)
     rows = []

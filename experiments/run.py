@@ -12,7 +12,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -305,17 +305,8 @@ def _plain(value):
     return np.asarray(value).tolist()
 
 
-def train(
-    spec: RunSpec, directory: str | Path, *, resume: bool = False, workers: int | None = None
-) -> str:
-    """Trains a population, or continues it.
-
-    Args, raises: as `make_run`.
-
-    Returns:
-      "finished" or "stopped" (by Ctrl-C: resume to continue).
-    """
-    run = make_run(spec, directory, resume=resume, workers=workers)
+def carry_out(run: Run) -> Literal["finished", "stopped"]:
+    """Trains to the end or to Ctrl-C, and closes the run and its simulators."""
     try:
         return run.train()
     finally:

@@ -1,0 +1,64 @@
+# Every target sets up .venv by itself. Settings: make train TASK="bullet/hopper" SEEDS="0 1 2".
+PYTHON ?= python3
+PRESET ?= cpu
+TASK   ?= bullet/inverted_pendulum
+SEEDS  ?= 0 1 2
+OMEGA  ?= 0 0.1 0.2 0.3 0.4 0.5
+SOURCE ?=
+OUT    ?= runs/$(subst /,_,$(firstword $(TASK)))-$(PRESET)
+ARGS   ?=
+
+VENV   := .venv
+RUN    := $(VENV)/bin/python
+STAMP   = $(VENV)/.installed-
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint train sweep evaluate report bench clean
+
+help:  ## List the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | \
+	  awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+# One stamp per set of extras, so that the demo installs no test tools.
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(STAMP)%: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(subst +,$(comma),$*)]"
+	@touch $@
+
+comma := ,
+
+setup: $(STAMP)bullet+dev  ## Set up .venv with everything
+
+demo: $(STAMP)bullet  ## Train a source, transfer it to eight targets, show what came of it (15 minutes)
+	$(RUN) -m experiments demo --out runs/demo $(ARGS)
+
+test: $(STAMP)bullet+dev  ## Run the test suite (10 minutes)
+	$(RUN) -m pytest $(ARGS)
+
+lint: $(STAMP)bullet+dev  ## Check the style
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+
+train: $(STAMP)bullet  ## Train on TASK with SEEDS and PRESET into OUT (resumes what is there)
+	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --out $(OUT) --resume $(ARGS)
+
+sweep: $(STAMP)bullet  ## Transfer SOURCE to TASK: every OMEGA and seed of SEEDS, and a baseline
+	@test -n "$(SOURCE)" || { echo 'error: name the source: make sweep TASK=bullet/hopper SOURCE=runs/source' >&2; exit 2; }
+	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --source $(SOURCE) \
+	  --omega $(OMEGA) --baseline --out $(OUT)-sweep --resume $(ARGS)
+
+evaluate: $(STAMP)bullet  ## Play 5 episodes with every agent in OUT, with videos
+	$(RUN) -m experiments evaluate $(OUT) --episodes 5 --video $(ARGS)
+
+report: $(STAMP)bullet  ## Print the table of OUT and draw its learning curves
+	$(RUN) -m experiments report $(OUT)
+
+bench: $(STAMP)bullet+dev  ## Run the benchmarks, one JSON line each
+	$(RUN) benchmarks/convolutions.py
+	$(RUN) benchmarks/update.py
+	$(RUN) benchmarks/rollout.py
+
+clean:  ## Remove .venv and caches; runs/ stays
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis *.egg-info

@@ -1,0 +1,116 @@
+"""Seconds per update of a population on random data: one JSON line.
+
+    python benchmarks/update.py depth=32 deter=200 stoch=30 units=400 B=50 L=50 H=15 A=6 n=5
+
+Further arguments: image (64 or 32), P members, precision (float32 or bfloat16), starts
+(imagination starts; 0 for all), mapping (auto, vmap or chunks) and chunk.
+"""
+
+import dataclasses
+import json
+import resource
+import statistics
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.config import LearningConfig, NetworkConfig, preset
+from dreamer_jax.training import init_members, update_members, zero_sums
+
+DEFAULTS = {
+    "depth": 32,
+    "deter": 200,
+    "stoch": 30,
+    "units": 400,
+    "B": 50,
+    "L": 50,
+    "H": 15,
+    "A": 6,
+    "n": 5,
+    "P": 1,
+    "image": 64,
+    "precision": "float32",
+    "starts": 0,
+    "mapping": "auto",
+    "chunk": 1,
+}
+
+
+def arguments(words):
+    """The defaults, changed by words of the form name=value."""
+    values = dict(DEFAULTS)
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in values:
+            sys.exit(f"unknown argument {name!r}: choose from {', '.join(DEFAULTS)}")
+        values[name] = type(DEFAULTS[name])(value)
+    return values
+
+
+def main():
+    a = arguments(sys.argv[1:])
+    config = dataclasses.replace(
+        preset("thesis"),
+        network=NetworkConfig(
+            image_size=a["image"],
+            encoder_depth=a["depth"],
+            stochastic_size=a["stoch"],
+            deterministic_size=a["deter"],
+            hidden_size=a["deter"],
+            head_units=a["units"],
+            precision=a["precision"],
+        ),
+        learning=LearningConfig(
+            batch_size=a["B"],
+            sequence_length=a["L"],
+            horizon=a["H"],
+            imagination_starts=a["starts"] or None,
+        ),
+    )
+    agent = Agent(config, a["A"])
+    random = np.random.default_rng(0)
+    shape = (a["P"], a["B"], a["L"])
+    batch = Batch(
+        image=random.integers(0, 256, (*shape, a["image"], a["image"], 3), dtype=np.uint8),
+        action=random.uniform(-1, 1, (*shape, a["A"])).astype(np.float32),
+        reward=random.normal(size=shape).astype(np.float32),
+        first=np.zeros(shape, bool),
+        terminal=np.zeros(shape, bool),
+    )
+    batch = jax.device_put(batch)
+    state = init_members(agent, jnp.arange(a["P"]))
+    sums = zero_sums(agent, state, a["B"], a["L"])
+    mapping = {"mapping": a["mapping"], "chunk": a["chunk"]}
+
+    def step(state, sums):
+        started = time.perf_counter()
+        state, sums, loss = update_members(agent, state, sums, batch, **mapping)
+        loss.block_until_ready()
+        return state, sums, time.perf_counter() - started
+
+    state, sums, first = step(state, sums)
+    seconds = []
+    for _ in range(a["n"]):
+        state, sums, elapsed = step(state, sums)
+        seconds.append(elapsed)
+    device = jax.devices()[0]
+    statistics_of_memory = device.memory_stats() or {}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    result = {
+        "benchmark": "update",
+        "device": device.device_kind,
+        "jax": jax.__version__,
+        "s_per_update": round(statistics.median(seconds), 5),
+        "compile_s": round(first - statistics.median(seconds), 2),
+        "peak_bytes": statistics_of_memory.get("peak_bytes_in_use", peak),
+        **a,
+    }
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
