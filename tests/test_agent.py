@@ -150,7 +150,9 @@ def test_frozen_components_do_not_move_and_cost_no_optimiser_memory(update, stat
     for name in ("encoder", "value"):
         chex.assert_trees_all_equal(new.params[name], start.params[name])
     for name in ("decoder", "dynamics", "reward", "actor"):
-        moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), new.params[name], start.params[name])
+        moved = jax.tree.map(
+            lambda a, b: jnp.abs(a - b).max(), new.params[name], start.params[name]
+        )
         assert max(jax.tree.leaves(moved)) > 0
     full = sum(x.size for x in jax.tree.leaves(state.optimisers))
     part = sum(x.size for x in jax.tree.leaves(start.optimisers))
@@ -180,9 +182,7 @@ def test_a_member_whose_loss_is_not_finite_is_frozen_and_the_others_go_on(agent)
     assert_array_equal(injected.healthy, [False, True])
     assert not np.isfinite(metrics["reward_loss"][0])
     member = [jax.tree.map(lambda x, p=p: x[p], injected) for p in range(2)]
-    chex.assert_trees_all_equal(
-        member[0].params, jax.tree.map(lambda x: x[0], states.params)
-    )
+    chex.assert_trees_all_equal(member[0].params, jax.tree.map(lambda x: x[0], states.params))
     chex.assert_trees_all_close(
         member[1].params, jax.tree.map(lambda x: x[1], healthy.params), atol=1e-6
     )
@@ -298,11 +298,13 @@ def test_the_policy_acts_on_the_states_that_training_observes(agent, state):
 
 def test_exploration_stays_in_the_range_of_actions(agent, state):
     image = batch_of().image[0, 0]
-    policy = jax.jit(jax.vmap(
-        lambda key: agent.policy(
-            state.params, agent.initial_carry(), image, jnp.bool_(True), key, "explore"
-        )[0]
-    ))
+    policy = jax.jit(
+        jax.vmap(
+            lambda key: agent.policy(
+                state.params, agent.initial_carry(), image, jnp.bool_(True), key, "explore"
+            )[0]
+        )
+    )
     actions = policy(jax.random.split(jax.random.key(0), 500))
     assert jnp.abs(actions).max() <= 1.0
     assert actions.std() > 0.2
@@ -311,7 +313,12 @@ def test_exploration_stays_in_the_range_of_actions(agent, state):
 def test_an_unknown_policy_mode_is_refused(agent, state):
     with pytest.raises(ValueError, match="'explore' or 'evaluate'"):
         agent.policy(
-            state.params, agent.initial_carry(), batch_of().image[0, 0], True, jax.random.key(0), "x"
+            state.params,
+            agent.initial_carry(),
+            batch_of().image[0, 0],
+            True,
+            jax.random.key(0),
+            "x",
         )
 
 

@@ -112,9 +112,7 @@ def test_a_first_record_makes_the_model_forget_all_before_it(model):
     def features(embeddings, actions):
         return rssm.observe(dynamics, params, embeddings, actions, first, key)[0].features
 
-    changed = features(
-        embeddings.at[:, :3].add(1.0), actions.at[:, :3].add(1.0).at[:, 3].add(5.0)
-    )
+    changed = features(embeddings.at[:, :3].add(1.0), actions.at[:, :3].add(1.0).at[:, 3].add(5.0))
     original = features(embeddings, actions)
     assert_array_equal(changed[:, 3:], original[:, 3:])
     assert not jnp.allclose(changed[:, :3], original[:, :3])
@@ -134,9 +132,7 @@ def test_observing_equals_its_steps_taken_one_by_one(model):
     variables, key = {"params": params}, jax.random.key(0)
     embeddings, actions = draws(B, L, E), draws(B, L, A)
     first = jnp.asarray(random.random((B, L)) < 0.3)
-    states, prior_mean, prior_std = rssm.observe(
-        dynamics, params, embeddings, actions, first, key
-    )
+    states, prior_mean, prior_std = rssm.observe(dynamics, params, embeddings, actions, first, key)
     noise = jax.random.normal(key, (L, B, 4))
     state = dynamics.initial((B,))
     for t in range(L):

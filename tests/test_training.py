@@ -111,9 +111,7 @@ def test_updates_are_not_compiled_again_after_the_first(finished):
     batch = run.replay.sample([0, 7], 0, learning.batch_size, learning.sequence_length)
     state = jax.tree.map(jnp.copy, run.state)
     sums = jax.tree.map(jnp.copy, run.sums)
-    training.update_members(
-        AGENT, state, sums, training.Batch(**batch), mapping="auto", chunk=1
-    )
+    training.update_members(AGENT, state, sums, training.Batch(**batch), mapping="auto", chunk=1)
     assert training.update_members._cache_size() == before
 
 

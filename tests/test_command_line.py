@@ -1,0 +1,196 @@
+"""The command line on real PyBullet tasks, at sizes of seconds."""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dreamer_jax.logs import read_metrics
+from experiments.__main__ import main
+
+pytest.importorskip("pybullet")
+
+ROOT = Path(__file__).parent.parent
+TRAIN = ("train", "--task", "bullet/inverted_pendulum", "--preset", "debug", "--seeds", "0", "1")
+
+
+def run(*arguments, code=0):
+    """Runs a command in a process of its own and returns what it printed."""
+    command = [sys.executable, "-m", "experiments", *map(str, arguments)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("demo")
+    return directory, run("demo", "--preset", "debug", "--out", directory)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("whole") / "run"
+    run(*TRAIN, "--out", directory)
+    return directory
+
+
+def test_the_demo_prints_its_table_report_and_scale(demo):
+    directory, output = demo
+    for label in ("omega=0", "omega=0.2", "omega=0.4", "baseline"):
+        assert any(line.startswith(label) and "±" in line for line in output.splitlines())
+    assert "reward/out/kernel" in output
+    assert "fraction(omega=0..0.4)" in output
+    assert "the machinery, not the effect" in output
+    members = {row["member"] for row in read_metrics(directory / "targets")}
+    assert members == set(range(8))
+
+
+def test_the_demo_writes_pictures_and_videos(demo):
+    directory, output = demo
+    for name in (
+        "curves.png",
+        "curves.svg",
+        "videos/evaluate_bullet_inverted_pendulum.mp4",
+        "videos/prediction_bullet_inverted_pendulum.mp4",
+    ):
+        file = directory / "targets" / name
+        assert file.stat().st_size > 1000
+        assert str(file) in output
+
+
+def test_the_demo_run_again_repeats_nothing(demo):
+    directory, _ = demo
+    before = (directory / "targets" / "metrics.jsonl").read_bytes()
+    output = run("demo", "--preset", "debug", "--out", directory)
+    assert (directory / "targets" / "metrics.jsonl").read_bytes() == before
+    assert "baseline" in output
+
+
+def test_what_was_transferred_is_written_leaf_by_leaf(demo):
+    directory, _ = demo
+    records = json.loads((directory / "targets" / "transfer.json").read_text())
+    by_leaf = {record["leaf"]: record for record in records}
+    assert by_leaf["reward/out/kernel"]["operation"] == "fraction"
+    assert by_leaf["actor/out/kernel"]["operation"] == "keep"
+    assert by_leaf["dynamics/action_in/kernel"]["operation"] == "keep"
+    copied = by_leaf["encoder/conv_0/kernel"]
+    assert copied["norm_after"] == pytest.approx(copied["norm_source"])
+    # omega = 0, 0.2 and 0.4 for two seeds each.
+    expected = [0.0, 0.0, 0.2, 0.2, 0.4, 0.4]
+    assert by_leaf["value/out/bias"]["parameters"]["omega"] == pytest.approx(expected)
+
+
+def test_a_run_killed_at_a_random_moment_and_resumed_is_the_same_to_the_byte(whole, tmp_path):
+    lines = len(read_metrics(whole))
+    directory = tmp_path / "run"
+    command = [sys.executable, "-m", "experiments", *TRAIN, "--out", str(directory)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+    wanted, deadline = random.randrange(1, lines - 1), time.monotonic() + 400
+    metrics = directory / "metrics.jsonl"
+    while process.poll() is None and time.monotonic() < deadline:
+        if metrics.exists() and metrics.read_bytes().count(b"\n") >= wanted:
+            break
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    run(*TRAIN, "--out", directory, "--resume")
+    assert metrics.read_bytes() == (whole / "metrics.jsonl").read_bytes(), f"killed at {wanted}"
+
+
+def test_evaluation_prints_a_row_per_agent_and_repeats_itself(whole):
+    run("evaluate", whole, "--episodes", "2")
+    first = json.loads((whole / "evaluation.json").read_text())["episodes"]
+    output = run("evaluate", whole, "--episodes", "2", "--video")
+    assert json.loads((whole / "evaluation.json").read_text())["episodes"] == first
+    assert len(first) == 4
+    assert len({row["return"] for row in first}) == 4
+    assert "baseline, seed 0, bullet/inverted_pendulum" in output
+    assert "prediction_bullet_inverted_pendulum.mp4" in output
+
+
+def test_a_report_says_that_a_run_is_incomplete(whole, tmp_path, capsys):
+    shutil.copytree(whole, tmp_path / "cut")
+    path = tmp_path / "cut" / "metrics.jsonl"
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(rows[: len(rows) // 2]))
+    assert main(["report", str(tmp_path / "cut")]) == 0
+    assert "of 8, incomplete" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "bullet/hoper"], "Did you mean bullet/hopper"),
+        (["--task", "hopper"], "expected one of bullet/ant"),
+        (["--preset", "thsis"], "did you mean 'thesis'"),
+        (["--seeds", "1", "1"], "a seed is named twice"),
+        (["--omega", "0.2"], "add --source DIR"),
+        (["--source", "nowhere"], "--omega 0 0.2"),
+        (["--source", "nowhere", "--omega", "0.2"], "nowhere holds no run"),
+        (["--source", "nowhere", "--omega", "1.2"], "must lie in \\[0, 1\\]"),
+        (["--imagination-starts", "11"], "10 posterior states"),
+        (["--frozen", "encodr"], "components are encoder"),
+    ],
+)
+def test_bad_input_ends_with_code_2_and_a_way_out(arguments, message, tmp_path, capsys):
+    words = ["train", "--preset", "debug", "--out", str(tmp_path / "run")]
+    if "--task" not in arguments:
+        words += ["--task", "bullet/hopper"]
+    try:
+        code = main(words + arguments)
+    except SystemExit as error:
+        code = error.code
+    assert code == 2
+    captured = capsys.readouterr()
+    text = " ".join((captured.out + captured.err).replace("│", " ").split())
+    assert re.search(message, text), text
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_source_of_other_sizes_is_refused_naming_both(whole, tmp_path, capsys):
+    code = main(
+        ["train", "--task", "bullet/hopper", "--preset", "debug", "--head-units", "9"]
+        + ["--source", str(whole), "--omega", "0.2", "--out", str(tmp_path / "run")]
+    )
+    assert code == 2
+    assert "head_units: 8 in the source, 9 here" in capsys.readouterr().err
+
+
+def test_a_source_without_that_member_is_refused(whole, tmp_path, capsys):
+    code = main(
+        ["train", "--task", "bullet/hopper", "--preset", "debug", "--source-member", "2"]
+        + ["--source", str(whole), "--omega", "0.2", "--out", str(tmp_path / "run")]
+    )
+    assert code == 2
+    assert "has members 0 to 1, member 2 was asked for" in capsys.readouterr().err
+
+
+def test_a_folder_of_another_run_is_refused_with_the_difference(whole, capsys):
+    assert main([*TRAIN, "--out", str(whole)]) == 2
+    assert "add --resume" in capsys.readouterr().err
+    code = main([*TRAIN, "--batch-size", "3", "--out", str(whole), "--resume"])
+    assert code == 2
+    assert "learning.batch_size: 2 / 3" in capsys.readouterr().err
+
+
+def test_evaluating_a_folder_without_a_run_is_refused(tmp_path, capsys):
+    assert main(["evaluate", str(tmp_path)]) == 2
+    assert "holds no run" in capsys.readouterr().err
+
+
+def test_help_explains_every_setting_with_the_presets_values(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "--help", "--preset", "debug"])
+    assert exit_.value.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--batch-size INT B, sequences in a batch. (default: 2)" in text
+    assert "in environment steps" in text
