@@ -42,6 +42,7 @@ from transfer.select import PyTree, Where, flatten, selected, unflatten
 
 
 def _change(target: PyTree, where: Where, leaf_operation: Callable[[str, Array], Array]) -> PyTree:
+    """The target with ``leaf_operation(path, leaf)`` in place of each selected leaf."""
     leaves = flatten(target)
     chosen = selected(target, where)
     return unflatten(
@@ -335,6 +336,7 @@ def crop(
 
 
 def _resize(target, source, axis, fill, groups, where, *, larger):
+    """The part that target and source share, group by group; ``larger`` is the larger of them."""
     sources = flatten(source)
 
     def leaf_operation(path, leaf):
@@ -342,11 +344,10 @@ def _resize(target, source, axis, fill, groups, where, *, larger):
         number = axis_number(path, axis, leaf)
         same_but(path, number, leaf, other)
         sizes = {"target": leaf.shape[number], "source": other.shape[number]}
-        if sizes[larger] < min(sizes.values()) or max(sizes.values()) > sizes[larger]:
-            other_name = "crop" if larger == "target" else "pad"
+        if sizes[larger] < max(sizes.values()):
             raise ValueError(
                 f"{path}: along axis {number} the target has {sizes['target']} and the source "
-                f"{sizes['source']}; use {other_name}."
+                f"{sizes['source']}; use {'crop' if larger == 'target' else 'pad'}."
             )
         if groups < 1 or any(size % groups for size in sizes.values()):
             raise ValueError(
