@@ -19,7 +19,7 @@ import numpy as np
 
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import LearningConfig, NetworkConfig, preset
-from dreamer_jax.training import init_members, update_members, zero_sums
+from dreamer_jax.population import init_members, update_members, zero_sums
 
 DEFAULTS = {
     "depth": 32,

@@ -357,7 +357,7 @@ class Agent:
         gradients = {"model": model_gradient, "actor": actor_gradient, "value": value_gradient}
         metrics |= behaviour_metrics | {"value_loss": value_loss}
         metrics |= {
-            f"{name}_gradient_norm": optax.global_norm(gradient)
+            f"{name}_gradient_norm": optax.tree.norm(gradient)
             for name, gradient in gradients.items()
             if gradient
         }
@@ -502,34 +502,3 @@ class Agent:
         truth = networks.normalise_image(batch.image)
         model = self.decode(params, features)
         return truth + 0.5, jnp.clip(model + 0.5, 0.0, 1.0)
-
-
-def map_members(function, mapping: str, chunk: int = 1):
-    """Maps a function of one member over a leading axis P of all its arguments.
-
-    Args:
-      function: of trees of one member.
-      mapping: "vmap" runs all members at once, "chunks" `chunk` members after `chunk` members;
-        "auto" is "chunks" on the CPU, where batched small products and grouped convolutions are
-        slower than a loop, and "vmap" elsewhere.
-      chunk: members in a chunk.
-
-    Raises:
-      ValueError: unknown mapping.
-    """
-    if mapping == "auto":
-        mapping = "chunks" if jax.default_backend() == "cpu" else "vmap"
-    if mapping == "vmap":
-        return jax.vmap(function)
-    if mapping != "chunks":
-        raise ValueError(f"unknown mapping {mapping!r}: choose auto, vmap or chunks")
-
-    def mapped(*trees):
-        members = jax.tree.leaves(trees)[0].shape[0]
-        if members == 1:
-            outputs = function(*jax.tree.map(lambda x: x[0], trees))
-            return jax.tree.map(lambda x: x[None], outputs)
-        batch_size = chunk if chunk > 1 else None
-        return jax.lax.map(lambda arguments: function(*arguments), trees, batch_size=batch_size)
-
-    return mapped

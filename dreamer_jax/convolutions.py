@@ -9,15 +9,21 @@ Every window has stride 2 and no padding ("VALID"). In the shapes below k is the
 kernel, C the input channels, O the output channels, and "..." any number of batch axes.
 """
 
+import math
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 Method = Literal["library", "matmul"]
 
 _DIMENSIONS = ("NHWC", "HWIO", "NHWC")
+_IN_BOUNDS = "promise_in_bounds"
+
+# Arrays of no more channels than this are taken for the images that a network starts or ends at.
+_IMAGE_CHANNELS = 4
 
 
 def default_method() -> Method:
@@ -83,8 +89,6 @@ def transposed_convolution(x, kernel, bias, *, method: Method | None = None):
         )
     if method == "library":
         compute = _library_transposed_convolution
-    elif x.shape[-3:-1] == (1, 1):
-        compute = _dense_transposed_convolution
     else:
         compute = _matmul_transposed_convolution
     return _over_batch(compute, x, kernel, bias)
@@ -126,14 +130,14 @@ def _check(name, x, kernel, bias, method):
 def _over_batch(compute, x, kernel, bias):
     """Call `compute` with the batch axes of x as one, and all arguments of x's type."""
     batch = x.shape[:-3]
-    out = compute(x.reshape(-1, *x.shape[-3:]), kernel.astype(x.dtype), bias.astype(x.dtype))
+    x = x.reshape(math.prod(batch), *x.shape[-3:])
+    out = compute(x, kernel.astype(x.dtype), bias.astype(x.dtype))
     return out.reshape(*batch, *out.shape[1:])
 
 
 def _library_convolution(x, kernel, bias):
-    return (
-        lax.conv_general_dilated(x, kernel, (2, 2), "VALID", dimension_numbers=_DIMENSIONS) + bias
-    )
+    x = lax.conv_general_dilated(x, kernel, (2, 2), "VALID", dimension_numbers=_DIMENSIONS)
+    return x + bias
 
 
 def _library_transposed_convolution(x, kernel, bias):
@@ -141,61 +145,162 @@ def _library_transposed_convolution(x, kernel, bias):
 
 
 def _matmul_convolution(x, kernel, bias):
-    """Fold 2 x 2 pixels into channels; what is left is a convolution of stride 1."""
-    k, _, channels, outputs = kernel.shape
-    taps = (k + 1) // 2
-    height, width = ((side - k) // 2 + taps for side in x.shape[1:3])
-    x = _fit(x, 2 * height, 2 * width)
-    x = x.reshape(-1, height, 2, width, 2, channels).transpose(0, 1, 3, 2, 4, 5)
-    x = x.reshape(-1, height, width, 4 * channels)
-    kernel = _fit(kernel[None], 2 * taps, 2 * taps)
-    kernel = kernel.reshape(taps, 2, taps, 2, channels, outputs).transpose(0, 2, 1, 3, 4, 5)
-    return _stride_1(x, kernel.reshape(taps, taps, 4 * channels, outputs)) + bias
+    return _batch_first(_contracting_layer(_batch_last(x), kernel, bias))
 
 
 def _matmul_transposed_convolution(x, kernel, bias):
-    """Make the 2 x 2 phases of the output as channels with stride 1, then unfold them."""
-    k, _, channels, outputs = kernel.shape
-    taps = (k + 1) // 2
-    out_height, out_width = (2 * (side - 1) + k for side in x.shape[1:3])
-    edge = taps - 1
-    x = jnp.pad(x, ((0, 0), (edge, edge), (edge, edge), (0, 0)))
-    kernel = kernel if k % 2 == 0 else jnp.pad(kernel, ((1, 0), (1, 0), (0, 0), (0, 0)))
-    kernel = kernel.reshape(taps, 2, taps, 2, channels, outputs)[:, ::-1, :, ::-1]
-    kernel = kernel.transpose(0, 2, 4, 1, 3, 5).reshape(taps, taps, channels, 4 * outputs)
-    y = _stride_1(x, kernel)
-    _, height, width, _ = y.shape
-    y = y.reshape(-1, height, width, 2, 2, outputs).transpose(0, 1, 3, 2, 4, 5)
-    y = y.reshape(-1, 2 * height, 2 * width, outputs)
-    return y[:, :out_height, :out_width] + bias
+    # The transposed convolution is the adjoint of the convolution with this kernel, [k, k, O, C].
+    kernel = kernel[::-1, ::-1].swapaxes(2, 3)
+    return _batch_first(_expanding_layer(_batch_last(x), kernel, bias))
 
 
-def _dense_transposed_convolution(x, kernel, bias):
-    """One pixel in: the output is the flipped kernel weighted by the channels of that pixel."""
-    return (
-        jnp.einsum("bc,hwco->bhwo", x[:, 0, 0], kernel[::-1, ::-1], **_ACCUMULATE).astype(x.dtype)
-        + bias
+# Below, arrays are [channels, height, width, B]. With the batch axis last, the pixels of a window
+# are gathered in long contiguous runs whatever the stride, and the result is already the operand
+# of a matrix product. Between two layers the change of axes costs nothing: XLA keeps the layout.
+#
+# Both layers and all their gradients are made of three operations on a large array (side n) and a
+# small one (side m = (n - k) // 2 + 1), joined by a kernel [k, k, large channels, small channels]:
+#   _contract   large, kernel -> small    the convolution, or the transposed one's input gradient
+#   _expand     small, kernel -> large    the transposed convolution, or the other's input gradient
+#   _correlate  large, small -> kernel    the kernel's gradient in both
+# All three return their sums in the type they were accumulated in.
+
+
+@jax.custom_vjp
+def _contracting_layer(large, kernel, bias):
+    return (_contract(large, kernel) + bias[:, None, None, None]).astype(large.dtype)
+
+
+def _contracting_layer_forward(large, kernel, bias):
+    return _contracting_layer(large, kernel, bias), (large, kernel)
+
+
+def _contracting_layer_backward(saved, gradient):
+    large, kernel = saved
+    gradients = (
+        _expand(gradient, kernel, *large.shape[1:3]),
+        _correlate(large, gradient, kernel.shape[0]),
+        _sum_by_channel(gradient),
     )
+    return tuple(each.astype(large.dtype) for each in gradients)
 
 
-def _stride_1(x, kernel):
-    """Convolve with stride 1, as one product of patches [..., k * k * C] and [k * k * C, O]."""
-    k, _, channels, outputs = kernel.shape
-    height, width = (side - k + 1 for side in x.shape[1:3])
-    patches = jnp.concatenate(
-        [x[:, i : i + height, j : j + width] for i in range(k) for j in range(k)], axis=-1
+_contracting_layer.defvjp(_contracting_layer_forward, _contracting_layer_backward)
+
+
+@jax.custom_vjp
+def _expanding_layer(small, kernel, bias):
+    height, width = (2 * (side - 1) + kernel.shape[0] for side in small.shape[1:3])
+    large = _expand(small, kernel, height, width)
+    # A loop, since XLA fuses nothing across one. Without it the backward pass would compute the
+    # sums of _overlap_add anew for every window that a pixel is in.
+    return lax.map(lambda each: (each[0] + each[1]).astype(small.dtype), (large, bias))
+
+
+def _expanding_layer_forward(small, kernel, bias):
+    return _expanding_layer(small, kernel, bias), (small, kernel)
+
+
+def _expanding_layer_backward(saved, gradient):
+    small, kernel = saved
+    gradients = (
+        _contract(gradient, kernel),
+        _correlate(gradient, small, kernel.shape[0]),
+        _sum_by_channel(gradient),
     )
-    weights = kernel.reshape(k * k * channels, outputs)
-    return jnp.matmul(patches, weights, **_ACCUMULATE).astype(x.dtype)
+    return tuple(each.astype(small.dtype) for each in gradients)
 
 
-def _fit(x, height, width):
-    """Crop x [B, height, width, C] to the size, or fill it up with zeros."""
-    x = x[:, :height, :width]
-    rows, columns = height - x.shape[1], width - x.shape[2]
-    if rows or columns:
-        x = jnp.pad(x, ((0, 0), (0, rows), (0, columns)) + ((0, 0),) * (x.ndim - 3))
-    return x
+_expanding_layer.defvjp(_expanding_layer_forward, _expanding_layer_backward)
 
 
-_ACCUMULATE = {"preferred_element_type": jnp.float32}
+def _contract(large, kernel):
+    windows = _windows(large, kernel.shape[0])
+    small = _product(_rows(kernel, 3).T, _rows(windows, 3))
+    return small.reshape(kernel.shape[3], *windows.shape[3:])
+
+
+def _expand(small, kernel, height, width):
+    windows = _product(_rows(kernel, 3), _rows(small, 1))
+    return _overlap_add(windows.reshape(*kernel.shape[:3], *small.shape[1:]), height, width)
+
+
+def _correlate(large, small, k):
+    windows = _windows(large, k)
+    kernel = _product(_rows(windows, 3), _rows(small, 1).T)
+    return kernel.reshape(k, k, large.shape[0], small.shape[0])
+
+
+def _sum_by_channel(x):
+    # As a product, since XLA would lay out the operand of a sum anew, batch axis first.
+    x = _rows(x, 1)
+    return _product(x, jnp.ones(x.shape[1], x.dtype))
+
+
+def _rows(x, axes):
+    """Reshape x to a matrix whose rows are the first `axes` axes."""
+    return x.reshape(math.prod(x.shape[:axes]), math.prod(x.shape[axes:]))
+
+
+def _product(a, b):
+    return jnp.matmul(a, b, preferred_element_type=jnp.promote_types(a.dtype, jnp.float32))
+
+
+def _windows(large, k):
+    """Gather the k x k windows at stride 2 of [C, n, n, B], as [k, k, C, m, m, B]."""
+    rows, columns = (
+        np.arange(k)[:, None] + 2 * np.arange((side - k) // 2 + 1) for side in large.shape[1:3]
+    )
+    windows = large.at[:, rows[:, None, :, None], columns[None, :, None, :]].get(mode=_IN_BOUNDS)
+    return windows.transpose(1, 2, 0, 3, 4, 5)
+
+
+def _overlap_add(windows, height, width):
+    """Add up windows [k, k, C, m, m, B] where they lie in [C, height, width, B].
+
+    The adjoint of `_windows`. In each direction a pixel lies in at most ceil(k / 2) windows.
+    """
+    k, windows_down, windows_across = windows.shape[0], *windows.shape[3:5]
+    windows = windows.transpose(2, 0, 1, 3, 4, 5)
+    if (windows_down, windows_across, height, width) == (1, 1, k, k):
+        return windows[:, :, :, 0, 0]
+    total = 0
+    for first_row in range(0, k, 2):
+        row, down, in_row = _covering(first_row, k, windows_down, height)
+        for first_column in range(0, k, 2):
+            column, across, in_column = _covering(first_column, k, windows_across, width)
+            pixels = windows.at[:, row[:, None], column, down[:, None], across].get(mode=_IN_BOUNDS)
+            total += jnp.where((in_row[:, None] & in_column)[:, :, None], pixels, 0)
+    return total
+
+
+def _covering(first, k, windows, size):
+    """Find, for each of `size` pixels in a line, the window in which it is number `first`.
+
+    That is for even pixels; odd ones are number `first + 1`. Returns the pixel's number in its
+    window, the number of the window, and whether there is such a window: where not, both are 0.
+    """
+    pixel = np.arange(size)
+    number = first + pixel % 2
+    window = (pixel - number) // 2
+    present = (number < k) & (window >= 0) & (window < windows)
+    return np.where(present, number, 0), np.where(present, window, 0), present
+
+
+# Images enter the first layer and leave the last one batch first, so there the change of axes is
+# real work. It is a loop over the rows for the reason given above, and so that it works by blocks.
+
+
+def _batch_last(x):
+    """Reorder [B, height, width, C] as [C, height, width, B]."""
+    if x.shape[3] > _IMAGE_CHANNELS:
+        return x.transpose(3, 1, 2, 0)
+    x = lax.map(lambda row: row.transpose(1, 2, 0), x.swapaxes(0, 1))
+    return x.transpose(2, 0, 1, 3)
+
+
+def _batch_first(x):
+    """Reorder [C, height, width, B] as [B, height, width, C]."""
+    if x.shape[0] > _IMAGE_CHANNELS:
+        return x.transpose(3, 1, 2, 0)
+    return lax.map(lambda row: row.transpose(2, 0, 1), x.transpose(1, 2, 0, 3)).swapaxes(0, 1)

@@ -1,15 +1,13 @@
-"""The schedule of a run: prefill, update, collect, evaluate, save (thesis algorithm 3, 3.2.1).
+"""A run: prefill, update, collect, evaluate, save (thesis algorithm 3).
 
-What comes next is a function of a few `Counters`, and every random number derives
-from a member's seed and those counters. So a run that is stopped anywhere and resumed from its
-last checkpoint gives the same metrics, byte for byte, as one that was not.
+What comes next is a function of a few counters (dreamer_jax.schedule), and every random number
+derives from a member's seed and those counters. So a run that is stopped anywhere and resumed
+from its last checkpoint gives the same metrics, byte for byte, as one that was not.
 
 Axis letters: P population member, K task, B batch, L sequence length, T ticks in a phase.
 """
 
 import dataclasses
-import functools
-import math
 import signal
 import threading
 import time
@@ -22,13 +20,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, AgentState, Batch, map_members
+from dreamer_jax.agent import Agent, AgentState, Batch
 from dreamer_jax.checkpoint import Checkpointer
-from dreamer_jax.config import ScheduleConfig
 from dreamer_jax.logs import MetricsWriter
+from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Progress
 from dreamer_jax.replay import Replay
 from dreamer_jax.rollout import Records, collect, episodes
+from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.video import tile, write_video
 
 MAXIMUM_VIDEO_MEMBERS = 9
@@ -49,126 +48,8 @@ class Member:
     tags: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Counters:
-    """How far a run has come.
-
-    Attributes:
-      rounds: rounds collected, prefill included; a round is one phase of each task.
-      updates: updates made.
-      evaluations: multiples of `evaluate_every` that have been evaluated.
-      averaged: updates in the running sums of metrics.
-    """
-
-    rounds: int = 0
-    updates: int = 0
-    evaluations: int = 0
-    averaged: int = 0
-
-
-Action = Literal["prefill", "update", "evaluate", "collect", "done"]
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Which action is next, in a run over `tasks` tasks."""
-
-    config: ScheduleConfig
-    tasks: int
-
-    @property
-    def prefill_rounds(self) -> int:
-        """Rounds of random actions: the configured phases, or one of each of several tasks."""
-        return self.config.prefill_phases if self.tasks == 1 else 1
-
-    @property
-    def rounds(self) -> int:
-        """Rounds of the whole run."""
-        return max(
-            self.prefill_rounds,
-            math.ceil(self.config.environment_steps / self.environment_steps(1)),
-        )
-
-    @property
-    def updates(self) -> int:
-        """Updates of the whole run."""
-        return self.updates_due(self.rounds)
-
-    def environment_steps(self, rounds: int) -> int:
-        """Environment steps of `rounds` rounds, summed over tasks."""
-        return rounds * self.tasks * self.config.phase_environment_steps
-
-    def updates_due(self, rounds: int) -> int:
-        """Updates that should have been made after `rounds` rounds."""
-        trained = max(0, rounds - self.prefill_rounds + 1)
-        return trained * self.tasks * self.config.updates_per_phase
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of one member in the whole run; a round that crosses several multiples of
-        `evaluate_every` is followed by one."""
-        rounds = range(self.prefill_rounds, self.rounds + 1)
-        crossed = {self.environment_steps(r) // self.config.evaluate_every for r in rounds}
-        return len(crossed - {0})
-
-    def next(self, done: Counters) -> Action:
-        """What to do after what is done."""
-        if done.rounds < self.prefill_rounds:
-            return "prefill"
-        if done.updates < self.updates_due(done.rounds):
-            return "update"
-        steps = self.environment_steps(done.rounds)
-        if done.evaluations < steps // self.config.evaluate_every:
-            return "evaluate"
-        return "collect" if done.rounds < self.rounds else "done"
-
-
 class NonFiniteError(FloatingPointError):
     """All members of a population have met losses or gradients that are not finite."""
-
-
-@functools.partial(jax.jit, static_argnames=("agent", "mapping", "chunk"), donate_argnums=(1, 2))
-def update_members(
-    agent: Agent, state: AgentState, sums, batch: Batch, *, mapping: str, chunk: int
-):
-    """One update of every member.
-
-    Args:
-      agent: the agent's functions.
-      state: leaves [P, ...]; its memory is reused.
-      sums: running sums of the metrics, [P] each; its memory is reused.
-      batch: leaves [P, B, L, ...].
-      mapping, chunk: see `dreamer_jax.agent.map_members`.
-
-    Returns:
-      The new state, the new sums, and the model's loss of this update, [P].
-    """
-    state, metrics = map_members(agent.update, mapping, chunk)(state, batch)
-    sums = jax.tree.map(jnp.add, sums, metrics)
-    return state, sums, metrics["model_loss"]
-
-
-@functools.partial(jax.jit, static_argnames="agent")
-def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
-    """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
-    return jax.vmap(agent.init)(seeds)
-
-
-def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> dict:
-    """Sums of metrics before the first update, [P] each, without running an update."""
-    size = agent.config.network.image_size
-    shape = (batch_size, length)
-    batch = Batch(
-        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
-        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
-        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
-        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
-        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
-    )
-    member = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
-    metrics = jax.eval_shape(agent.update, member, batch)[1]
-    members = state.updates.shape[0]
-    return {name: jnp.zeros(members, x.dtype) for name, x in metrics.items()}
 
 
 class StopRequest:

@@ -1,0 +1,1 @@
+"""Runs of populations, their evaluation and reports, and the command line."""

@@ -9,7 +9,7 @@ import dataclasses
 from pathlib import Path
 
 from dreamer_jax.config import Config
-from dreamer_jax.training import Schedule
+from dreamer_jax.schedule import Schedule
 from experiments.run import RunSpec
 
 SOURCE_TASKS = ("bullet/inverted_double_pendulum", "bullet/halfcheetah")

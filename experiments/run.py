@@ -25,7 +25,8 @@ from dreamer_jax.agent import Agent, AgentState
 from dreamer_jax.checkpoint import Checkpointer, load_tree
 from dreamer_jax.config import Config
 from dreamer_jax.files import read_json, write_json_atomically
-from dreamer_jax.training import Member, Run, init_members
+from dreamer_jax.population import init_members
+from dreamer_jax.training import Member, Run
 from transfer.recipes import fractional_transfer
 
 BASELINE = "baseline"

@@ -46,7 +46,7 @@ class Probe:
         return State(position, jnp.int32(0), limit, key, episode)
 
     def reset(self, slot, key):
-        state = self._start(jax.random.fold_in(key, slot), jnp.int32(0))
+        state = self._start(key, jnp.int32(0))
         false = jnp.bool_(False)
         return state, TimeStep(self._image(state.position), jnp.float32(0), ~false, false)
 

@@ -11,8 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dreamer_jax import rssm
-from dreamer_jax.agent import Agent, Batch, map_members
+from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import preset
+from dreamer_jax.population import map_members
 
 A = 2
 CONFIG = preset("debug")
@@ -55,10 +56,12 @@ def state(agent):
 
 def test_updates_lower_the_losses_on_one_repeated_batch(update, state):
     batch = batch_of()
+    # Plain images: those of batch_of are noise, which no decoder of this size can learn.
+    batch = batch._replace(image=np.full_like(batch.image, 255))
     _, before = update(state, batch)
-    for _ in range(60):
+    for _ in range(300):
         state, metrics = update(state, batch)
-    assert metrics["image_loss"] < 0.9 * before["image_loss"]
+    assert metrics["image_loss"] < 0.5 * before["image_loss"]
     assert metrics["reward_loss"] < 0.9 * before["reward_loss"]
 
 
@@ -107,25 +110,25 @@ def test_an_unknown_mapping_is_refused_with_the_choices(agent):
 
 
 def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, state):
-    posterior, _, _ = agent.observe(state.params, batch_of(), jax.random.key(0))
+    posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(0))
 
     def loss(params):
         return agent.actor_loss({}, params, posterior, jax.random.key(1))[0]
 
-    def loss_of_actor(actor):
-        return agent.actor_loss({"actor": actor}, state.params, posterior, jax.random.key(1))[0]
+    @jax.jit
+    @jax.grad
+    def gradient_of_actor(actor, params):
+        return agent.actor_loss({"actor": actor}, params, posterior, jax.random.key(1))[0]
 
     # Only what is passed as trainable gets a gradient: dynamics, reward and value get none.
-    assert optax.global_norm(jax.grad(loss)(state.params)) == 0.0
-    gradient = jax.grad(loss_of_actor)(state.params["actor"])
+    assert optax.tree.norm(jax.jit(jax.grad(loss))(state.params)) == 0.0
+    gradient = gradient_of_actor(state.params["actor"], state.params)
     assert all(jnp.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
     # Where actions have no effect on the next state, no gradient reaches the actor.
     params = jax.tree.map(lambda x: x, state.params)
     params["dynamics"]["action_in"]["kernel"] *= 0.0
-    blind = jax.grad(
-        lambda actor: agent.actor_loss({"actor": actor}, params, posterior, jax.random.key(1))[0]
-    )(params["actor"])
-    assert optax.global_norm(blind) == 0.0
+    blind = gradient_of_actor(params["actor"], params)
+    assert optax.tree.norm(blind) == 0.0
 
 
 def test_no_gradient_of_actor_or_value_reaches_the_world_model(agent, state):
@@ -137,7 +140,8 @@ def test_no_gradient_of_actor_or_value_reaches_the_world_model(agent, state):
         )
         return actor + agent.value_loss({"value": params["value"]}, params, imagined)
 
-    assert optax.global_norm(jax.grad(loss)(state.params["encoder"])) == 0.0
+    gradient = jax.jit(jax.grad(loss))(state.params["encoder"])
+    assert optax.tree.norm(gradient) == 0.0
 
 
 def test_frozen_components_do_not_move_and_cost_no_optimiser_memory(update, state):
@@ -198,10 +202,10 @@ def test_a_member_whose_loss_is_not_finite_is_frozen_and_the_others_go_on(agent)
 
 def test_imagination_from_fewer_states_costs_less(agent):
     fewer = Agent(with_settings("learning", imagination_starts=3), A)
-    params = jax.jit(fewer.init_params)(jax.random.key(0))
+    params = jax.eval_shape(fewer.init_params, jax.random.key(0))
     posterior = jax.tree.map(jnp.zeros_like, agent.dynamics.initial((B, L)))
-    _, ((features, returns, weights), _) = fewer.actor_loss(
-        {}, params, posterior, jax.random.key(0)
+    _, ((features, returns, weights), _) = jax.eval_shape(
+        fewer.actor_loss, {}, params, posterior, jax.random.key(0)
     )
     horizon = CONFIG.learning.horizon
     assert features.shape == (horizon, 3, CONFIG.network.feature_size)
@@ -216,7 +220,7 @@ def test_a_termination_head_learns_the_discount_and_shortens_imagined_returns():
     for _ in range(150):
         state, metrics = step(state, batch)
     # Every record is terminal, so the learned discount falls towards zero.
-    posterior, _, _ = agent.observe(state.params, batch, jax.random.key(0))
+    posterior, _, _ = jax.jit(agent.observe)(state.params, batch, jax.random.key(0))
     discount = jax.nn.sigmoid(agent.head(state.params, "termination", posterior.features))
     assert discount.mean() < 0.35
     assert metrics["termination_loss"] < 0.7
@@ -277,22 +281,21 @@ def test_the_policy_acts_on_the_states_that_training_observes(agent, state):
     batch = batch_of()
     sequence = jax.tree.map(lambda x: x[:1], batch)._replace(first=np.zeros((1, L), bool))
     key = jax.random.key(0)
-    states, _, _ = agent.observe(state.params, sequence, key)
+    states, _, _ = jax.jit(agent.observe)(state.params, sequence, key)
     noise = jax.random.normal(key, (L, 1, CONFIG.network.stochastic_size))
     carry = agent.initial_carry().state
-    variables = {"params": state.params["dynamics"]}
-    for t in range(L):
-        embedding = agent.encode(state.params, sequence.image[:, t])[0]
+
+    @jax.jit
+    def step(carry, image, action, noise):
+        variables = {"params": state.params["dynamics"]}
+        embedding = agent.encode(state.params, image[None])[0]
         projected = agent.dynamics.apply(variables, embedding, method="project")
-        carry = agent.dynamics.apply(
-            variables,
-            carry,
-            sequence.action[0, t],
-            projected,
-            jnp.bool_(False),
-            noise[t, 0],
-            method="obs_step",
+        return agent.dynamics.apply(
+            variables, carry, action, projected, jnp.bool_(False), noise, method="obs_step"
         )
+
+    for t in range(L):
+        carry = step(carry, sequence.image[0, t], sequence.action[0, t], noise[t, 0])
         assert_allclose(carry.features, states.features[0, t], atol=1e-5)
 
 
@@ -343,8 +346,9 @@ def test_predictions_see_the_context_and_nothing_of_what_follows(agent, state):
     changed = batch._replace(image=batch.image.copy())
     changed.image[:, 3:] = 0
     key = jax.random.key(0)
-    truth, one = agent.predict(state.params, batch, 3, key)
-    _, two = agent.predict(state.params, changed, 3, key)
+    predict = jax.jit(agent.predict, static_argnums=2)
+    truth, one = predict(state.params, batch, 3, key)
+    _, two = predict(state.params, changed, 3, key)
     assert_array_equal(one, two)
     assert_allclose(truth, batch.image / 255.0, atol=1e-6)
     assert one.shape == truth.shape

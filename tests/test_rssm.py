@@ -109,6 +109,7 @@ def test_a_first_record_makes_the_model_forget_all_before_it(model):
     first = jnp.zeros((B, L), bool).at[:, 3].set(True)
     key = jax.random.key(0)
 
+    @jax.jit
     def features(embeddings, actions):
         return rssm.observe(dynamics, params, embeddings, actions, first, key)[0].features
 
@@ -122,8 +123,9 @@ def test_without_a_first_record_the_model_remembers(model):
     dynamics, params = model
     embeddings, actions = draws(B, L, E), draws(B, L, A)
     first, key = jnp.zeros((B, L), bool), jax.random.key(0)
-    one, _, _ = rssm.observe(dynamics, params, embeddings, actions, first, key)
-    two, _, _ = rssm.observe(dynamics, params, embeddings.at[:, 0].add(1), actions, first, key)
+    observe = jax.jit(rssm.observe, static_argnums=0)
+    one, _, _ = observe(dynamics, params, embeddings, actions, first, key)
+    two, _, _ = observe(dynamics, params, embeddings.at[:, 0].add(1), actions, first, key)
     assert not jnp.allclose(one.features[:, -1], two.features[:, -1])
 
 
@@ -132,7 +134,8 @@ def test_observing_equals_its_steps_taken_one_by_one(model):
     variables, key = {"params": params}, jax.random.key(0)
     embeddings, actions = draws(B, L, E), draws(B, L, A)
     first = jnp.asarray(random.random((B, L)) < 0.3)
-    states, prior_mean, prior_std = rssm.observe(dynamics, params, embeddings, actions, first, key)
+    observe = jax.jit(rssm.observe, static_argnums=0)
+    states, prior_mean, prior_std = observe(dynamics, params, embeddings, actions, first, key)
     noise = jax.random.normal(key, (L, B, 4))
     state = dynamics.initial((B,))
     for t in range(L):
@@ -178,7 +181,7 @@ def test_orthogonal_matrices_are_orthonormal_in_float32(shape):
 
 
 def test_orthogonal_matrices_have_no_preferred_sign():
-    matrices = jax.vmap(lambda key: rssm.orthogonal(key, (4, 12)))(
+    matrices = jax.jit(jax.vmap(lambda key: rssm.orthogonal(key, (4, 12))))(
         jax.random.split(jax.random.key(0), 2000)
     )
     assert_allclose(matrices.mean(0), 0.0, atol=5 * (1 / 12) ** 0.5 / 2000**0.5)

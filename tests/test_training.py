@@ -13,10 +13,12 @@ from probes import BrokenProbe, Probe
 
 from dreamer_jax import config as configs
 from dreamer_jax import training
-from dreamer_jax.agent import Agent
+from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import preset
 from dreamer_jax.logs import read_metrics
-from dreamer_jax.training import Counters, Member, NonFiniteError, Run, Schedule
+from dreamer_jax.population import update_members
+from dreamer_jax.schedule import Counters, Schedule
+from dreamer_jax.training import Member, NonFiniteError, Run
 
 CONFIG = preset("debug")
 # Shared, so that all runs of these tests share their compiled functions.
@@ -104,15 +106,14 @@ def test_a_run_fills_its_replay_and_writes_videos(finished):
 
 
 def test_updates_are_not_compiled_again_after_the_first(finished):
-    assert training.update_members._cache_size() <= 2
-    before = training.update_members._cache_size()
+    before = update_members._cache_size()
     _, run = finished
     learning = CONFIG.learning
     batch = run.replay.sample([0, 7], 0, learning.batch_size, learning.sequence_length)
     state = jax.tree.map(jnp.copy, run.state)
     sums = jax.tree.map(jnp.copy, run.sums)
-    training.update_members(AGENT, state, sums, training.Batch(**batch), mapping="auto", chunk=1)
-    assert training.update_members._cache_size() == before
+    update_members(AGENT, state, sums, Batch(**batch), mapping="auto", chunk=1)
+    assert update_members._cache_size() == before
 
 
 def test_members_of_one_population_do_not_influence_one_another(finished, tmp_path):
