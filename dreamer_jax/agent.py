@@ -270,6 +270,8 @@ class Agent:
         Returns:
           The action, float32 [A], and the new memory.
         """
+        if mode not in ("explore", "evaluate"):
+            raise ValueError(f"unknown policy mode {mode!r}: choose 'explore' or 'evaluate'")
         latent_key, action_key, explore_key = jax.random.split(key, 3)
         variables = {"params": params["dynamics"]}
         projected = self.dynamics.apply(
@@ -282,11 +284,9 @@ class Agent:
         outputs = self.head(params, "actor", state.features)
         if mode == "evaluate":
             action = self._mode(outputs, action_key)
-        elif mode == "explore":
+        else:
             action = self._sample(outputs, self._action_noise(action_key, ()))
             action = self._explore(action, explore_key, updates)
-        else:
-            raise ValueError(f"unknown policy mode {mode!r}: choose 'explore' or 'evaluate'")
         return action, Carry(state, action)
 
     def random_action(self, key: jax.Array) -> jax.Array:

@@ -268,12 +268,13 @@ def test_the_policy_forgets_across_a_first_image(agent, state):
     fresh = agent.initial_carry()
     other = jax.tree.map(lambda x: x + 1.0, fresh)
     key = jax.random.key(0)
-    actions = [
-        policy(state.params, carry, image, jnp.bool_(first), key, mode="evaluate")[0]
+    remembered = [
+        policy(state.params, carry, image, jnp.bool_(first), key, mode="evaluate")
         for carry, first in ((fresh, True), (other, True), (other, False))
     ]
-    assert_array_equal(actions[0], actions[1])
-    assert not jnp.allclose(actions[0], actions[2])
+    chex.assert_trees_all_equal(remembered[0], remembered[1])
+    features = [carry.state.features for _, carry in remembered]
+    assert not jnp.allclose(features[0], features[2])
 
 
 def test_the_policy_acts_on_the_states_that_training_observes(agent, state):
