@@ -161,7 +161,8 @@ def plot_curves(directory: str | Path, path: str | Path | None = None) -> list[P
         axis.set_xlabel("environment steps")
         axis.set_ylabel("return of an evaluation episode")
         axis.grid(alpha=0.3)
-        axis.legend(frameon=False)
+        if len(names) > 1:
+            axis.legend(frameon=False)
     paths = [stem.with_suffix(suffix) for suffix in (".png", ".svg")]
     for file in paths:
         figure.savefig(file, dpi=150)
