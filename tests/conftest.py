@@ -1,10 +1,14 @@
-"""Compiled functions are kept on disk, so that tests, and the processes they start, share them."""
+"""Settings of JAX for tests and the processes they start, made before JAX is imported anywhere."""
 
 import os
 from pathlib import Path
 
-# Before JAX is imported anywhere, and inherited by subprocesses.
+# Compiled functions are kept on disk, so that tests and their subprocesses share them.
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+# What tests compile runs for milliseconds: quick compilation matters more than quick code.
+os.environ["XLA_FLAGS"] = (
+    os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
+).strip()
