@@ -131,6 +131,8 @@ def test_a_pattern_that_matches_nothing_names_what_was_meant():
 def test_a_count_that_is_off_lists_what_was_found():
     with pytest.raises(ValueError, match=r"select 2 leaves, expected 3: reward/hidden_0/kernel,"):
         transfer.select(AGENT, "reward/**", count=3)
+    with pytest.raises(ValueError, match="select 2 leaves, expected 1"):
+        transfer.select(AGENT, "reward/**", count=1)
 
 
 def test_no_pattern_is_an_error():
