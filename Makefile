@@ -36,7 +36,7 @@ demo: $(STAMP)bullet  ## Train a source, transfer it to eight targets, show what
 	$(RUN) -m experiments demo --out runs/demo $(ARGS)
 
 test: $(STAMP)bullet+dev  ## Run the test suite (10 minutes)
-	$(RUN) -m pytest $(ARGS)
+	$(RUN) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
 
 lint: $(STAMP)bullet+dev  ## Check the style
 	$(RUN) -m ruff check .
