@@ -19,6 +19,7 @@ import numpy as np
 
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import LearningConfig, NetworkConfig, preset
+from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.population import init_members, update_members, zero_sums
 
 DEFAULTS = {
@@ -53,6 +54,8 @@ def arguments(words):
 
 def main():
     a = arguments(sys.argv[1:])
+    # As the command line does.
+    keep_freed_memory()
     config = dataclasses.replace(
         preset("thesis"),
         network=NetworkConfig(

@@ -23,6 +23,7 @@ import optax
 
 from dreamer_jax import losses, networks, rssm
 from dreamer_jax.config import COMPONENTS, Config
+from dreamer_jax.convolutions import arrange, image_distance, normalise_image
 
 Params = dict[str, Any]
 Metrics = dict[str, jax.Array]
@@ -226,7 +227,7 @@ class Agent:
 
     def encode(self, params: Params, image: jax.Array) -> jax.Array:
         """Embeddings: uint8 [..., size, size, 3] -> [..., E]."""
-        image = networks.normalise_image(image)
+        image = normalise_image(image)
         return self.encoder.apply({"params": params["encoder"]}, image)
 
     def decode(self, params: Params, features: jax.Array) -> jax.Array:
@@ -348,14 +349,14 @@ class Agent:
         (_, (posterior, metrics)), model_gradient = jax.value_and_grad(
             self.model_loss, has_aux=True
         )(parts["model"], params, batch, model_key)
-        (_, (imagined, behaviour_metrics)), actor_gradient = jax.value_and_grad(
-            self.actor_loss, has_aux=True
-        )(parts["actor"], params, posterior, behaviour_key)
-        value_loss, value_gradient = jax.value_and_grad(self.value_loss)(
-            parts["value"], params, imagined
-        )
-        gradients = {"model": model_gradient, "actor": actor_gradient, "value": value_gradient}
-        metrics |= behaviour_metrics | {"value_loss": value_loss}
+        (_, behaviour_metrics), behaviour_gradient = jax.value_and_grad(
+            self.behaviour_loss, has_aux=True
+        )(parts["actor"] | parts["value"], params, posterior, behaviour_key)
+        gradients = {"model": model_gradient} | {
+            name: {part: behaviour_gradient[part] for part in parts[name]}
+            for name in ("actor", "value")
+        }
+        metrics |= behaviour_metrics
         metrics |= {
             f"{name}_gradient_norm": optax.tree.norm(gradient)
             for name, gradient in gradients.items()
@@ -392,11 +393,10 @@ class Agent:
         """
         learning = self.config.learning
         params = params | trainable
+        batch = batch._replace(image=arrange(batch.image))
         posterior, prior_mean, prior_std = self.observe(params, batch, key)
         features = posterior.features
-        image_loss = losses.unit_gaussian_loss(
-            self.decode(params, features), networks.normalise_image(batch.image), event_axes=3
-        )
+        image_loss = image_distance(self.decode(params, features), batch.image).mean()
         reward_loss = losses.unit_gaussian_loss(self.reward(params, features), batch.reward)
         kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
         loss = image_loss + reward_loss
@@ -411,22 +411,24 @@ class Agent:
         metrics["model_loss"] = loss
         return loss, (posterior, metrics)
 
-    def actor_loss(
+    def behaviour_loss(
         self, trainable: Params, params: Params, posterior: rssm.LatentState, key: jax.Array
     ):
-        """Loss of the actor, whose gradient comes through the dynamics of imagined states.
+        """Loss of the actor plus loss of the value head, both on the same imagined states.
 
-        The policy reads stopped features: the gradient reaches an action through the states and
-        rewards that follow it, not through the states that the policy saw before.
+        The actor's gradient comes through the dynamics. The policy reads stopped features: the
+        gradient reaches an action through the states and rewards that follow it, not through the
+        states that the policy saw before. The value head is trained towards returns that are held
+        fixed, on features that are, so neither loss has a gradient for the other's parameters.
 
         Args:
-          trainable: {"actor": ...}, or empty where the actor is frozen.
+          trainable: the components of "actor" and "value" that the gradient is taken for.
           params: all components.
           posterior: states to start from, leaves [B, L, ...]; no gradient reaches them.
           key: for starts, actions and states.
 
         Returns:
-          The loss, and ((features [H, N, M], returns and weights [H - 1, N]), metrics).
+          The sum of the losses, and metrics.
         """
         learning = self.config.learning
         starts_key, action_key, state_key = jax.random.split(key, 3)
@@ -447,26 +449,22 @@ class Agent:
         )
         features = states.features
         rewards = self.reward(params, features)
-        values = self.value(params, features)
+        values, trained_values = _forked(self.value, params, features)
         if "termination" in self.heads:
             discounts = jax.nn.sigmoid(self.head(params, "termination", features)[..., 0])
         else:
             discounts = jnp.full_like(rewards, learning.discount)
         returns = losses.lambda_return(rewards, values, discounts, learning.return_lambda)
         weights = losses.trajectory_weights(discounts)
-        loss = losses.actor_loss(returns, weights)
+        actor_loss = losses.actor_loss(returns, weights)
+        value_loss = losses.value_loss(trained_values[:-1], returns, weights)
         metrics = {
-            "actor_loss": loss,
+            "actor_loss": actor_loss,
+            "value_loss": value_loss,
             "imagined_reward": rewards.mean(),
             "imagined_value": values.mean(),
         }
-        return loss, ((features, returns, weights), metrics)
-
-    def value_loss(self, trainable: Params, params: Params, imagined) -> jax.Array:
-        """Loss of the value head on the states that the actor's loss imagined."""
-        features, returns, weights = jax.lax.stop_gradient(imagined)
-        values = self.value(params | trainable, features[:-1])
-        return losses.value_loss(values, returns, weights)
+        return actor_loss + value_loss, metrics
 
     def predict(
         self, params: Params, batch: Batch, context: int, key: jax.Array
@@ -499,6 +497,29 @@ class Agent:
         features = jnp.concatenate(
             [posterior.features, jnp.swapaxes(states.features, 0, 1)], axis=1
         )
-        truth = networks.normalise_image(batch.image)
+        truth = normalise_image(batch.image)
         model = self.decode(params, features)
         return truth + 0.5, jnp.clip(model + 0.5, 0.0, 1.0)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _forked(function, params, features):
+    """function(params, features) twice, computed once.
+
+    The gradient of the first reaches the features only, that of the second the parameters only.
+    """
+    output = function(params, features)
+    return output, output
+
+
+def _forked_forward(function, params, features):
+    output, pull_back = jax.vjp(function, params, features)
+    return (output, output), pull_back
+
+
+def _forked_backward(function, pull_back, gradients):
+    to_features, to_params = gradients
+    return pull_back(to_params)[0], pull_back(to_features)[1]
+
+
+_forked.defvjp(_forked_forward, _forked_backward)

@@ -22,9 +22,6 @@ Method = Literal["library", "matmul"]
 _DIMENSIONS = ("NHWC", "HWIO", "NHWC")
 _IN_BOUNDS = "promise_in_bounds"
 
-# Arrays of no more channels than this are taken for the images that a network starts or ends at.
-_IMAGE_CHANNELS = 4
-
 
 def default_method() -> Method:
     """Return the faster method on the default device: "matmul" on a CPU, "library" elsewhere."""
@@ -94,12 +91,63 @@ def transposed_convolution(x, kernel, bias, *, method: Method | None = None):
     return _over_batch(compute, x, kernel, bias)
 
 
-def _check(name, x, kernel, bias, method):
-    """Raise if the arguments do not fit one another; return the method to use."""
+def arrange(images, *, method: Method | None = None):
+    """Lay images out in memory as the method reads them; the array itself is the same.
+
+    Transposing images is work at the two ends of a network only: done here once, on bytes, it
+    serves the first layer and `image_distance` alike.
+
+    Args:
+      images: uint8 [..., height, width, 3].
+      method: as for `convolution`.
+
+    Returns:
+      The images, with the batch axes last in memory where the method is "matmul".
+    """
+    if _resolved("arrange", method) == "library":
+        return images
+    rows = images.reshape(-1, *images.shape[-3:]).swapaxes(0, 1)
+    # A loop, since XLA fuses nothing across one: the layers that follow would gather from the
+    # images as they were.
+    rows = lax.map(lambda row: row.transpose(1, 2, 0), rows)
+    return rows.transpose(3, 0, 1, 2).reshape(images.shape)
+
+
+def image_distance(prediction, images, *, method: Method | None = None):
+    """Compute half the squared distance of predicted and true images, summed over pixels.
+
+    Args:
+      prediction: float32 [..., height, width, 3], about [-0.5, 0.5]; the output of
+        `transposed_convolution`.
+      images: uint8 [..., height, width, 3], best laid out by `arrange`.
+      method: as for `convolution`.
+
+    Returns:
+      float32 [...]; no gradient reaches the images.
+    """
+    if _resolved("image_distance", method) == "library":
+        return 0.5 * ((prediction - normalise_image(images)) ** 2).sum((-3, -2, -1))
+    flat = (_batch_last(x.reshape(-1, *x.shape[-3:])) for x in (prediction, images))
+    return 0.5 * (_error(*flat) ** 2).sum((0, 1, 2)).reshape(prediction.shape[:-3])
+
+
+def normalise_image(images):
+    """uint8 [..., height, width, 3] -> float32 in [-0.5, 0.5]."""
+    return images.astype(jnp.float32) / 255.0 - 0.5
+
+
+def _resolved(name, method):
+    """Return the method to use; raise if there is no such method."""
     if method is None:
-        method = default_method()
+        return default_method()
     if method not in ("library", "matmul"):
         raise ValueError(f"{name}: got method {method!r}, expected 'library', 'matmul' or None")
+    return method
+
+
+def _check(name, x, kernel, bias, method):
+    """Raise if the arguments do not fit one another; return the method to use."""
+    method = _resolved(name, method)
     if not jnp.issubdtype(x.dtype, jnp.floating):
         raise ValueError(
             f"{name}: got x of type {x.dtype}, expected a floating type; convert images with "
@@ -192,9 +240,7 @@ _contracting_layer.defvjp(_contracting_layer_forward, _contracting_layer_backwar
 def _expanding_layer(small, kernel, bias):
     height, width = (2 * (side - 1) + kernel.shape[0] for side in small.shape[1:3])
     large = _expand(small, kernel, height, width)
-    # A loop, since XLA fuses nothing across one. Without it the backward pass would compute the
-    # sums of _overlap_add anew for every window that a pixel is in.
-    return lax.map(lambda each: (each[0] + each[1]).astype(small.dtype), (large, bias))
+    return _add_by_channel(large, bias.__getitem__).astype(small.dtype)
 
 
 def _expanding_layer_forward(small, kernel, bias):
@@ -287,20 +333,29 @@ def _covering(first, k, windows, size):
     return np.where(present, number, 0), np.where(present, window, 0), present
 
 
-# Images enter the first layer and leave the last one batch first, so there the change of axes is
-# real work. It is a loop over the rows for the reason given above, and so that it works by blocks.
+def _add_by_channel(x, addend):
+    """Add addend(c) to each channel c of [C, height, width, B], in place.
+
+    A loop, since XLA fuses nothing across one. Without it the backward pass would compute what
+    x is made of anew for every window that a pixel is in.
+    """
+    return lax.fori_loop(0, x.shape[0], lambda c, x: x.at[c].add(addend(c).astype(x.dtype)), x)
+
+
+@jax.custom_vjp
+def _error(prediction, images):
+    """Compute prediction - normalise_image(images), both [C, height, width, B]."""
+    return _add_by_channel(prediction, lambda c: -normalise_image(images[c]))
+
+
+_error.defvjp(lambda *arguments: (_error(*arguments), None), lambda _, gradient: (gradient, None))
 
 
 def _batch_last(x):
     """Reorder [B, height, width, C] as [C, height, width, B]."""
-    if x.shape[3] > _IMAGE_CHANNELS:
-        return x.transpose(3, 1, 2, 0)
-    x = lax.map(lambda row: row.transpose(1, 2, 0), x.swapaxes(0, 1))
-    return x.transpose(2, 0, 1, 3)
+    return x.transpose(3, 1, 2, 0)
 
 
 def _batch_first(x):
     """Reorder [C, height, width, B] as [B, height, width, C]."""
-    if x.shape[0] > _IMAGE_CHANNELS:
-        return x.transpose(3, 1, 2, 0)
-    return lax.map(lambda row: row.transpose(2, 0, 1), x.transpose(1, 2, 0, 3)).swapaxes(0, 1)
+    return x.transpose(3, 1, 2, 0)

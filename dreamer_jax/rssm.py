@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from dreamer_jax.networks import Dense, Dtype, glorot_uniform
+from dreamer_jax.networks import Dense, Dtype, elu, glorot_uniform
 
 
 class LatentState(NamedTuple):
@@ -124,7 +124,7 @@ class Prior(nn.Module):
         self.out = Dense(self.outputs, dtype=self.dtype)
 
     def __call__(self, deterministic: jax.Array) -> jax.Array:
-        return self.out(nn.elu(self.hidden(deterministic)))
+        return self.out(elu(self.hidden(deterministic)))
 
 
 class Posterior(nn.Module):
@@ -143,7 +143,7 @@ class Posterior(nn.Module):
         return self.hidden.project(embedding)
 
     def __call__(self, deterministic: jax.Array, projected: jax.Array) -> jax.Array:
-        return self.out(nn.elu(self.hidden(deterministic, projected)))
+        return self.out(elu(self.hidden(deterministic, projected)))
 
 
 class Dynamics(nn.Module):
@@ -184,7 +184,7 @@ class Dynamics(nn.Module):
         return LatentState(mean, std, mean + std * noise, deterministic)
 
     def _recur(self, state: LatentState, action: jax.Array) -> jax.Array:
-        x = nn.elu(self.stoch_in(state.stochastic) + self.action_in(action))
+        x = elu(self.stoch_in(state.stochastic) + self.action_in(action))
         return self.gru(x, state.deterministic)
 
     def img_step(self, state: LatentState, action: jax.Array, noise: jax.Array) -> LatentState:

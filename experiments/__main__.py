@@ -14,6 +14,7 @@ import tyro
 from dreamer_jax import config as configs
 from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.config import Config
+from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
 
@@ -117,6 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with usage_errors():
             command = _parse(arguments)
         _keep_compiled_functions()
+        keep_freed_memory()
         run = {Train: _train, Evaluate: _evaluate, Report: _report, Demo: _demo}[type(command)]
         return run(command)
     except UsageError as error:

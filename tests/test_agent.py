@@ -1,6 +1,7 @@
 """Laws of the agent's update and policy, at sizes that compile in seconds."""
 
 import dataclasses
+import functools
 
 import chex
 import jax
@@ -113,12 +114,12 @@ def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, st
     posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(0))
 
     def loss(params):
-        return agent.actor_loss({}, params, posterior, jax.random.key(1))[0]
+        return agent.behaviour_loss({}, params, posterior, jax.random.key(1))[0]
 
     @jax.jit
     @jax.grad
     def gradient_of_actor(actor, params):
-        return agent.actor_loss({"actor": actor}, params, posterior, jax.random.key(1))[0]
+        return agent.behaviour_loss({"actor": actor}, params, posterior, jax.random.key(1))[0]
 
     # Only what is passed as trainable gets a gradient: dynamics, reward and value get none.
     assert optax.tree.norm(jax.jit(jax.grad(loss))(state.params)) == 0.0
@@ -132,16 +133,34 @@ def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, st
 
 
 def test_no_gradient_of_actor_or_value_reaches_the_world_model(agent, state):
-    def loss(image_weights):
-        params = state.params | {"encoder": image_weights}
+    def loss(encoder):
+        params = state.params | {"encoder": encoder}
         posterior, _, _ = agent.observe(params, batch_of(), jax.random.key(0))
-        actor, (imagined, _) = agent.actor_loss(
-            {"actor": params["actor"]}, params, posterior, jax.random.key(1)
-        )
-        return actor + agent.value_loss({"value": params["value"]}, params, imagined)
+        trainable = {name: params[name] for name in ("actor", "value")}
+        return agent.behaviour_loss(trainable, params, posterior, jax.random.key(1))[0]
 
     gradient = jax.jit(jax.grad(loss))(state.params["encoder"])
     assert optax.tree.norm(gradient) == 0.0
+
+
+def test_the_gradients_of_actor_and_value_are_those_of_their_own_losses(agent, state):
+    posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(0))
+    parts = {name: state.params[name] for name in ("actor", "value")}
+
+    def gradient_of(name):
+        def loss(trainable, posterior):
+            total, metrics = agent.behaviour_loss(
+                trainable, state.params, posterior, jax.random.key(1)
+            )
+            return total if name is None else metrics[name]
+
+        return jax.jit(jax.grad(loss))(parts, posterior)
+
+    both, actor, value = map(gradient_of, (None, "actor_loss", "value_loss"))
+    assert optax.tree.norm(actor["value"]) == 0.0
+    assert optax.tree.norm(value["actor"]) == 0.0
+    chex.assert_trees_all_close(both["actor"], actor["actor"], rtol=1e-4, atol=1e-6)
+    chex.assert_trees_all_close(both["value"], value["value"], rtol=1e-4, atol=1e-6)
 
 
 def test_frozen_components_do_not_move_and_cost_no_optimiser_memory(update, state):
@@ -203,12 +222,13 @@ def test_imagination_from_fewer_states_costs_less(agent):
     fewer = Agent(with_settings("learning", imagination_starts=3), A)
     params = jax.eval_shape(fewer.init_params, jax.random.key(0))
     posterior = jax.tree.map(jnp.zeros_like, agent.dynamics.initial((B, L)))
-    _, ((features, returns, weights), _) = jax.eval_shape(
-        fewer.actor_loss, {}, params, posterior, jax.random.key(0)
-    )
-    horizon = CONFIG.learning.horizon
-    assert features.shape == (horizon, 3, CONFIG.network.feature_size)
-    assert returns.shape == weights.shape == (horizon - 1, 3)
+
+    def matrix_products(agent):
+        loss = functools.partial(agent.behaviour_loss, {})
+        lowered = jax.jit(loss).lower(params, posterior, jax.random.key(0))
+        return lowered.cost_analysis()["flops"]
+
+    assert matrix_products(fewer) < matrix_products(agent) * 4 / (B * L)
 
 
 def test_a_termination_head_learns_the_discount_and_shortens_imagined_returns():

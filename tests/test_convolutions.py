@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dreamer_jax.convolutions import convolution, default_method, transposed_convolution
+from dreamer_jax.convolutions import (
+    arrange,
+    convolution,
+    default_method,
+    image_distance,
+    normalise_image,
+    transposed_convolution,
+)
 
 METHODS = ("library", "matmul")
 LAYERS = (convolution, transposed_convolution)
@@ -239,3 +246,33 @@ def test_an_image_smaller_than_the_kernel_is_refused():
 def test_a_transposed_convolution_of_kernel_1_is_refused():
     with pytest.raises(ValueError, match="kernel of 1 x 1, expected 2 x 2 or more"):
         transposed_convolution(*draw((), 3, 3, 1, 3, 5))
+
+
+def some_images(*batch):
+    return np.random.default_rng(0).integers(0, 256, (*batch, 8, 6, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_arranged_images_are_the_same_images(method):
+    images = some_images(2, 3)
+    assert_array_equal(arrange(images, method=method), images)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_distance_of_images_is_half_the_sum_of_squares_and_so_is_its_gradient(method):
+    images = some_images(2, 3)
+    prediction = np.random.default_rng(1).normal(size=images.shape).astype(np.float32)
+    weights = np.arange(1.0, 7.0, dtype=np.float32).reshape(2, 3)
+
+    def loss(prediction):
+        distance = image_distance(prediction, arrange(images, method=method), method=method)
+        return (weights * distance).sum(), distance
+
+    gradient, distance = jax.jit(jax.grad(loss, has_aux=True))(prediction)
+    error = prediction - (images / 255.0 - 0.5)
+    assert_allclose(distance, 0.5 * (error**2).sum((2, 3, 4)), rtol=1e-5)
+    assert_allclose(gradient, weights[..., None, None, None] * error, rtol=1e-5, atol=1e-5)
+
+
+def test_normalised_images_lie_between_minus_and_plus_one_half():
+    assert_allclose(normalise_image(np.array([0, 255], np.uint8)), [-0.5, 0.5])

@@ -79,9 +79,11 @@ def test_kernels_lie_in_the_range_of_glorot_and_fill_it():
     assert_allclose(kernel.std(), limit / math.sqrt(3), rtol=0.02)
 
 
-def test_pixels_are_normalised_to_half_around_zero():
-    image = jnp.array([0, 255], jnp.uint8)
-    assert_allclose(networks.normalise_image(image), [-0.5, 0.5])
+def test_elu_is_that_of_jax_and_so_is_its_gradient():
+    x = jnp.array([-100.0, -3.0, -1e-3, 0.0, 1e-3, 2.0, 100.0])
+    assert_allclose(networks.elu(x), jax.nn.elu(x), atol=1e-7)
+    gradient, expected = (jax.vmap(jax.grad(f))(x) for f in (networks.elu, jax.nn.elu))
+    assert_allclose(gradient, expected, rtol=1e-6)
 
 
 def test_the_action_distribution_is_that_of_dreamer():
