@@ -3,6 +3,8 @@
 P population member, K tasks, A action. A jitted program reaches a simulator through an ordered
 host callback. JAX refuses to vmap those, so each is wrapped in `custom_vmap`, whose rule hands the
 whole batch to the same callback once more: however many axes are mapped, one tick is one call.
+Each array that goes to the host or comes back costs as much as the call itself, so all but the
+images travel as one row of 32-bit words for each simulator.
 """
 
 from __future__ import annotations
@@ -37,27 +39,37 @@ def _mapped_callback(host: Callable, results) -> Callable:
     """An ordered callback that takes any leading axes, in one call of `host`.
 
     Args:
-        host: called with arrays that share leading axes `lead` (those of the first argument,
-            otherwise a scalar), returns results of shapes lead + the shapes of `results`.
+        host: called with int32 [*lead, W], returns results of shapes lead + those of `results`.
         results: tree of `jax.ShapeDtypeStruct`, the results for one simulator.
+
+    Returns:
+        The function of int32 [W]. Map over the words if anything is mapped.
     """
 
     @custom_vmap
-    def call(*arguments):
-        lead = arguments[0].shape
+    def call(words):
+        lead = words.shape[:-1]
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(lead + x.shape, x.dtype), results)
-        return io_callback(host, shapes, *arguments, ordered=True)
+        return io_callback(host, shapes, words, ordered=True)
 
     @call.def_vmap
-    def _(axis_size, in_batched, *arguments):
-        arguments = [
-            x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-            for x, batched in zip(arguments, in_batched, strict=True)
-        ]
-        out = call(*arguments)
+    def _(axis_size, in_batched, words):
+        out = call(words)
         return out, jax.tree.map(lambda _: True, out)
 
     return call
+
+
+def _words(*values: jax.Array) -> jax.Array:
+    """The bits of scalars and vectors of 32-bit types, joined: int32 [W]."""
+    return jnp.concatenate(
+        [jax.lax.bitcast_convert_type(jnp.atleast_1d(x), jnp.int32) for x in values]
+    )
+
+
+def _time_step(slot, image, words) -> tuple[Token, TimeStep]:
+    reward = jax.lax.bitcast_convert_type(words[1], jnp.float32)
+    return Token(slot, words[0]), TimeStep(image, reward, words[2] != 0, words[3] != 0)
 
 
 class HostEnv:
@@ -93,14 +105,11 @@ class HostEnv:
         self._pool = SimulatorPool(
             self.tasks * members, image_size, action_size, action_repeat, workers
         )
-        time_step = TimeStep(
-            image=jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
-            reward=jax.ShapeDtypeStruct((), jnp.float32),
-            first=jax.ShapeDtypeStruct((), jnp.bool_),
-            terminal=jax.ShapeDtypeStruct((), jnp.bool_),
+        # The image, and the words of tick, reward, first and terminal.
+        self._results = (
+            jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
+            jax.ShapeDtypeStruct((4,), jnp.int32),
         )
-        tick = jax.ShapeDtypeStruct((), jnp.int32)
-        self._results = (tick, time_step)
         self._call_reset = _mapped_callback(self._guarded(self._host_reset), self._results)
         self._call_step = _mapped_callback(self._guarded(self._host_step), self._results)
 
@@ -118,8 +127,7 @@ class HostEnv:
                 f"got slots of shape {slot.shape} and keys of shape {key.shape[:-1]}, expected "
                 "one slot and one key: map over several with jax.vmap"
             )
-        tick, time_step = self._call_reset(slot, key)
-        return Token(slot, tick), time_step
+        return _time_step(slot, *self._call_reset(_words(slot, key)))
 
     def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
         """One tick with `action` (float32 [A], clipped to [-1, 1])."""
@@ -128,8 +136,8 @@ class HostEnv:
                 f"got an action of shape {action.shape}, expected {(self.action_size,)}: "
                 "map over several simulators with jax.vmap"
             )
-        tick, time_step = self._call_step(*state, jnp.asarray(action, jnp.float32))
-        return Token(state.slot, tick), time_step
+        words = _words(*state, jnp.asarray(action, jnp.float32))
+        return _time_step(state.slot, *self._call_step(words))
 
     def check(self) -> None:
         """Wait for callbacks under way and raise the error that one of them met, if any.
@@ -148,34 +156,36 @@ class HostEnv:
         self._pool.close()
 
     def _guarded(self, host: Callable) -> Callable:
-        """`host` over flat batches of NumPy arrays; its errors are kept and zeros returned."""
+        """`host` over rows of words, int32 [n, W]; its errors are kept and zeros returned."""
 
-        def call(slot, *others):
-            slot = np.asarray(slot)
-            lead, count = slot.shape, slot.size
+        def call(words):
+            words = np.asarray(words)
+            lead = words.shape[:-1]
             if self._error is None:
                 try:
-                    others = [np.asarray(x) for x in others]
-                    others = [x.reshape(count, *x.shape[len(lead) :]) for x in others]
-                    tick, time_step = host(slot.reshape(count), *others)
-                    return tick.reshape(lead), TimeStep(
-                        *(leaf.reshape(lead + leaf.shape[1:]) for leaf in time_step)
-                    )
+                    tick, time_step = host(words.reshape(-1, words.shape[-1]))
+                    rest = np.empty((len(tick), 4), np.int32)
+                    rest[:, 0] = tick
+                    rest[:, 1] = time_step.reward.astype(np.float32).view(np.int32)
+                    rest[:, 2] = time_step.first
+                    rest[:, 3] = time_step.terminal
+                    image = time_step.image
+                    return image.reshape(*lead, *image.shape[1:]), rest.reshape(*lead, 4)
                 except BaseException as error:  # KeyboardInterrupt too: `check` raises it
                     self._error = error
-            return jax.tree.map(lambda x: np.zeros(lead + x.shape, x.dtype), self._results)
+            return tuple(np.zeros(lead + x.shape, x.dtype) for x in self._results)
 
         return call
 
-    def _host_reset(self, slots: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, TimeStep]:
+    def _host_reset(self, words: np.ndarray) -> tuple[np.ndarray, TimeStep]:
+        slots, keys = words[:, 0], words[:, 1:].view(np.uint32)
         self._check_slots(slots)
         self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
         time_step = self._pool.reset(slots, keys)
         return self._ticks[slots], time_step
 
-    def _host_step(
-        self, slots: np.ndarray, ticks: np.ndarray, actions: np.ndarray
-    ) -> tuple[np.ndarray, TimeStep]:
+    def _host_step(self, words: np.ndarray) -> tuple[np.ndarray, TimeStep]:
+        slots, ticks, actions = words[:, 0], words[:, 1], words[:, 2:].view(np.float32)
         self._check_slots(slots)
         now = self._ticks[slots]
         if (never := now < 0).any():

@@ -16,6 +16,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 import weakref
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -26,7 +27,7 @@ from typing import IO
 import numpy as np
 
 from envs.base import SimulatorError, TaskSpec, TimeStep
-from envs.worker import WorkerSettings, record_type
+from envs.worker import ACTIVE_WAIT, WorkerSettings, record_type
 
 _BOOTSTRAP = (
     "import sys; sys.path[:] = sys.argv[3:]; "
@@ -96,6 +97,8 @@ class SimulatorPool:
         by_task = sorted(range(slots), key=lambda slot: self.tasks[slot].name)
         self._worker_of = {slot: index % count for index, slot in enumerate(by_task)}
 
+        # With a core to spare, the pool waits awake, as its workers do.
+        self._active_wait = ACTIVE_WAIT if count < available_cores() else 0.0
         layout = record_type(action_size, image_size)
         self._request_number = 0
         self._workers: list[_Worker] = []
@@ -164,6 +167,9 @@ class SimulatorPool:
         """
         pending = {self._workers[index].connection: self._workers[index] for index in workers}
         failures, dead = [], None
+        deadline = time.perf_counter() + self._active_wait
+        while not wait(list(pending), timeout=0) and time.perf_counter() < deadline:
+            os.sched_yield()
         while pending:
             # Woken now and then, since a fork of a dead worker may keep its connection open.
             for connection in wait(list(pending), timeout=2.0) or list(pending):

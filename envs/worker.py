@@ -12,6 +12,7 @@ import os
 import pickle
 import pkgutil
 import signal
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -23,6 +24,9 @@ import numpy as np
 
 from envs.base import Simulator, TaskSpec, TimeStep
 from envs.wrappers import ActionPadding, ActionRepeat
+
+# Seconds for which either end asks again for the other's message before it falls asleep.
+ACTIVE_WAIT = 0.003
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,11 @@ def _serve(connection: Connection, phases: dict[int, Phase], records: np.ndarray
     actions = records["action"]
     results = TimeStep(*(records[name] for name in TimeStep._fields))
     while True:
+        # Asleep, a core takes longer to wake up than many simulators take for a tick. So ask again
+        # for as long as a policy thinks, leaving the core to whoever wants it.
+        deadline = time.perf_counter() + ACTIVE_WAIT
+        while not connection.poll(0) and time.perf_counter() < deadline:
+            os.sched_yield()
         # The end of the connection is not enough: a fork of the parent may keep it open.
         while not connection.poll(2.0):
             if os.getppid() != parent:
