@@ -56,10 +56,8 @@ evaluate: $(STAMP)bullet  ## Play 5 episodes with every agent in OUT, with video
 report: $(STAMP)bullet  ## Print the table of OUT and draw its learning curves
 	$(RUN) -m experiments report $(OUT)
 
-bench: $(STAMP)bullet+dev  ## Run the benchmarks, one JSON line each
-	$(RUN) benchmarks/convolutions.py
-	$(RUN) benchmarks/update.py
-	$(RUN) benchmarks/rollout.py
+bench: $(STAMP)bullet+dev  ## Run the benchmarks and write runs/benchmarks/table.md (an hour)
+	$(RUN) -m benchmarks runs/benchmarks $(ARGS)
 
 clean:  ## Remove .venv and caches; runs/ stays
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis *.egg-info

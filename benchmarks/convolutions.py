@@ -1,6 +1,6 @@
 """Time the gradients of the encoder's and the decoder's convolutions, computed either way.
 
-    python benchmarks/convolutions.py depth=16 images=320 image_size=32 n=9
+    python -m benchmarks.convolutions depth=16 images=320 image_size=32 n=9
 
 Prints one line of JSON. `wall` and `cpu` are milliseconds for one gradient, medians of n runs; the
 ways take turns, so that all meet the same load. `cpu` sums over threads and suffers less from other

@@ -1,6 +1,6 @@
 """Agent steps per second: simulators through the bridge, beside the same simulators bare.
 
-    python benchmarks/rollout.py [task=bullet/hopper,bullet/ant] [P=1,3,8] [steps=200]
+    python -m benchmarks.rollout [task=bullet/hopper,bullet/ant] [P=1,3,8] [steps=200]
                                  [image_size=64] [workers=2] [repetitions=3]
 
 Prints one line of JSON. "bridge" is a jitted scan over vmapped steps with random actions, "bare" a

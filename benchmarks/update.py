@@ -1,6 +1,6 @@
 """Seconds per update of a population on random data: one JSON line.
 
-    python benchmarks/update.py depth=32 deter=200 stoch=30 units=400 B=50 L=50 H=15 A=6 n=5
+    python -m benchmarks.update depth=32 deter=200 stoch=30 units=400 B=50 L=50 H=15 A=6 n=5
 
 Further arguments: image (64 or 32), P members, precision (float32 or bfloat16), starts
 (imagination starts; 0 for all), mapping (auto, vmap or chunks) and chunk.
@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer_jax.agent import Agent, Batch
-from dreamer_jax.config import LearningConfig, NetworkConfig, preset
+from dreamer_jax.config import Config, LearningConfig, NetworkConfig, preset
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.population import init_members, update_members, zero_sums
 
-DEFAULTS = {
+SIZES = {
     "depth": 32,
     "deter": 200,
     "stoch": 30,
@@ -31,50 +31,48 @@ DEFAULTS = {
     "L": 50,
     "H": 15,
     "A": 6,
-    "n": 5,
-    "P": 1,
     "image": 64,
     "precision": "float32",
     "starts": 0,
-    "mapping": "auto",
-    "chunk": 1,
 }
+DEFAULTS = {**SIZES, "n": 5, "P": 1, "mapping": "auto", "chunk": 1}
 
 
-def arguments(words):
+def read_arguments(words, defaults):
     """The defaults, changed by words of the form name=value."""
-    values = dict(DEFAULTS)
+    values = dict(defaults)
     for word in words:
         name, _, value = word.partition("=")
         if name not in values:
-            sys.exit(f"unknown argument {name!r}: choose from {', '.join(DEFAULTS)}")
-        values[name] = type(DEFAULTS[name])(value)
+            sys.exit(f"unknown argument {name!r}: choose from {', '.join(defaults)}")
+        values[name] = type(defaults[name])(value)
     return values
 
 
-def main():
-    a = arguments(sys.argv[1:])
-    # As the command line does.
-    keep_freed_memory()
-    config = dataclasses.replace(
-        preset("thesis"),
-        network=NetworkConfig(
-            image_size=a["image"],
-            encoder_depth=a["depth"],
-            stochastic_size=a["stoch"],
-            deterministic_size=a["deter"],
-            hidden_size=a["deter"],
-            head_units=a["units"],
-            precision=a["precision"],
-        ),
-        learning=LearningConfig(
-            batch_size=a["B"],
-            sequence_length=a["L"],
-            horizon=a["H"],
-            imagination_starts=a["starts"] or None,
-        ),
+def settings(a) -> Config:
+    """A configuration of the sizes given by short names; others are the thesis's."""
+    a = {**SIZES, **a}
+    network = NetworkConfig(
+        image_size=a["image"],
+        encoder_depth=a["depth"],
+        stochastic_size=a["stoch"],
+        deterministic_size=a["deter"],
+        hidden_size=a["deter"],
+        head_units=a["units"],
+        precision=a["precision"],
     )
-    agent = Agent(config, a["A"])
+    learning = LearningConfig(
+        batch_size=a["B"],
+        sequence_length=a["L"],
+        horizon=a["H"],
+        imagination_starts=a["starts"] or None,
+    )
+    return dataclasses.replace(preset("thesis"), network=network, learning=learning)
+
+
+def prepare(a):
+    """A function without arguments that makes one update of P members and returns its seconds."""
+    agent = Agent(settings(a), a["A"])
     random = np.random.default_rng(0)
     shape = (a["P"], a["B"], a["L"])
     batch = Batch(
@@ -87,19 +85,26 @@ def main():
     batch = jax.device_put(batch)
     state = init_members(agent, jnp.arange(a["P"]))
     sums = zero_sums(agent, state, a["B"], a["L"])
-    mapping = {"mapping": a["mapping"], "chunk": a["chunk"]}
 
-    def step(state, sums):
+    def step():
+        nonlocal state, sums
         started = time.perf_counter()
-        state, sums, loss = update_members(agent, state, sums, batch, **mapping)
+        state, sums, loss = update_members(
+            agent, state, sums, batch, mapping=a["mapping"], chunk=a["chunk"]
+        )
         loss.block_until_ready()
-        return state, sums, time.perf_counter() - started
+        return time.perf_counter() - started
 
-    state, sums, first = step(state, sums)
-    seconds = []
-    for _ in range(a["n"]):
-        state, sums, elapsed = step(state, sums)
-        seconds.append(elapsed)
+    return step
+
+
+def main():
+    a = read_arguments(sys.argv[1:], DEFAULTS)
+    # As the command line does.
+    keep_freed_memory()
+    step = prepare(a)
+    first = step()
+    seconds = [step() for _ in range(a["n"])]
     device = jax.devices()[0]
     statistics_of_memory = device.memory_stats() or {}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
