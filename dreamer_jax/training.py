@@ -117,6 +117,12 @@ class Run:
                 f"the environment takes actions of size {env.action_size}, the agent gives "
                 f"{agent.action_size}: build both for the same tasks"
             )
+        if env.discrete != agent.discrete:
+            kinds = ["discrete" if x.discrete else "continuous" for x in (env, agent)]
+            raise ValueError(
+                f"the environment takes {kinds[0]} actions, the agent gives {kinds[1]} ones: "
+                "build both for the same tasks"
+            )
         if env.image_size != config.network.image_size:
             raise ValueError(
                 f"the environment renders {env.image_size} pixels, the agent reads "
