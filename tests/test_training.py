@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import BrokenProbe, Probe
+from probes import BrokenProbe, Probe, Walk
 
 from dreamer_jax import config as configs
 from dreamer_jax import training
@@ -303,9 +303,9 @@ def test_an_environment_of_other_sizes_is_refused_naming_both(tmp_path):
         run_in(tmp_path, agent=Agent(CONFIG, 2, discrete=True))
 
 
-def test_the_probe_is_solved_in_seconds(tmp_path):
-    # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
-    config = dataclasses.replace(
+def learning_config():
+    """Small networks and 1200 updates, which are enough to solve a probe."""
+    return dataclasses.replace(
         CONFIG,
         network=dataclasses.replace(CONFIG.network, head_units=32, hidden_size=32),
         learning=dataclasses.replace(
@@ -327,10 +327,36 @@ def test_the_probe_is_solved_in_seconds(tmp_path):
             checkpoint_every=2000,
         ),
     )
+
+
+def test_the_probe_is_solved_in_seconds(tmp_path):
+    # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
+    config = learning_config()
     agent, env = Agent(config, 2), Probe(falls=False)
     trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
     score = [row for row in read_metrics(tmp_path) if row["kind"] == "evaluation"][-1]["return"]
     assert score > 0.8 * config.schedule.phase_ticks
+
+
+def test_discrete_choices_are_learned_with_their_values(tmp_path):
+    config = learning_config()
+    agent, env, ticks = Agent(config, 3, discrete=True), Walk(), config.schedule.phase_ticks
+    run, _ = trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
+    # From any cell the best choices lose a tick at most.
+    rows = read_metrics(tmp_path)
+    score = [row for row in rows if row["kind"] == "evaluation"][-1]["return"]
+    assert 0.8 * ticks < score <= ticks
+    random = [row["return"] for row in rows if row.get("policy") == "random"]
+    assert np.mean(random) < 0.5 * ticks
+    # Discount 0.5: values 2, 1 and 0.5 at distances 0, 1 and 2.
+    batch = Batch(**run.replay.sample([0], 10**6, 50, 8))
+    params = jax.tree.map(lambda x: x[0], run.state.params)
+    batch = jax.tree.map(lambda x: x[0], batch)
+    posterior, _, _ = jax.jit(agent.observe)(params, batch, jax.random.key(0))
+    values = np.asarray(agent.value(params, posterior.features))
+    distance = np.abs(Walk.cell_of(batch.image) - Walk.middle)
+    means = [values[~batch.first & (distance == d)].mean() for d in range(3)]
+    np.testing.assert_allclose(means, [2, 1, 0.5], atol=0.35)
 
 
 def test_a_configuration_survives_json():
