@@ -135,9 +135,10 @@ def elu(x: jax.Array) -> jax.Array:
     """x where it is positive, exp(x) - 1 elsewhere.
 
     `jax.nn.elu` is more exact about 0 by expm1, which takes several times as long on a CPU; here
-    the error is that of rounding at 1.
+    the error is that of rounding at 1, in float32 whatever the dtype of x.
     """
-    return jnp.where(x > 0, x, jnp.exp(jnp.where(x > 0, 0.0, x)) - 1)
+    exponential = jnp.exp(jnp.where(x > 0, 0.0, x).astype(jnp.float32))
+    return jnp.where(x > 0, x, (exponential - 1).astype(x.dtype))
 
 
 class Head(nn.Module):
