@@ -146,6 +146,9 @@ class ScheduleConfig:
     """Environment steps between evaluations."""
     checkpoint_every: int = 10_000
     """Environment steps between checkpoints."""
+    replay_keep: int | None = None
+    """Newest records of each task that are sampled, older ones being deleted from the disk; none
+    given: all of them."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
     """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
     mapping_chunk: int = 1
@@ -175,6 +178,13 @@ class Config:
     learning: LearningConfig = field(default_factory=LearningConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+    def __post_init__(self):
+        keep, length = self.schedule.replay_keep, self.learning.sequence_length
+        _require(
+            keep is None or keep >= length,
+            f"replay_keep is {keep}, but a sequence has {length} records",
+        )
 
 
 def _presets() -> dict[str, Config]:

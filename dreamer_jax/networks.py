@@ -21,6 +21,14 @@ Dtype = jnp.dtype | type
 glorot_uniform = nn.initializers.glorot_uniform()
 
 
+def add_bias(outputs: jax.Array, bias: jax.Array) -> jax.Array:
+    """A layer's outputs [..., O] plus its float32 bias [O], in the dtype of the outputs.
+
+    Added in float32, so that the gradient of the bias, a sum over the batch, is summed in it.
+    """
+    return (outputs + bias).astype(outputs.dtype)
+
+
 class Dense(nn.Module):
     """A dense layer drawn as Keras draws it.
 
@@ -49,7 +57,7 @@ class Dense(nn.Module):
         outputs = inputs.astype(self.dtype) @ kernel.astype(self.dtype)
         if self.use_bias:
             bias = self.param("bias", nn.initializers.zeros, (self.features,))
-            outputs = outputs + bias.astype(self.dtype)
+            outputs = add_bias(outputs, bias)
         return outputs
 
 
@@ -127,9 +135,10 @@ def elu(x: jax.Array) -> jax.Array:
     """x where it is positive, exp(x) - 1 elsewhere.
 
     `jax.nn.elu` is more exact about 0 by expm1, which takes several times as long on a CPU; here
-    the error is that of rounding at 1.
+    the error is that of rounding at 1, in float32 whatever the dtype of x.
     """
-    return jnp.where(x > 0, x, jnp.exp(jnp.where(x > 0, 0.0, x)) - 1)
+    exponential = jnp.exp(jnp.where(x > 0, 0.0, x).astype(jnp.float32))
+    return jnp.where(x > 0, x, (exponential - 1).astype(x.dtype))
 
 
 class Head(nn.Module):

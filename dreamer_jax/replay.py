@@ -4,8 +4,10 @@ Each population member has one stream per task, a file `member_000/task_0.record
 records. Record t holds image t and the action and reward that led to it; `first` marks a reset
 (zero action and reward) and `terminal` an episode that ended by falling. Records are never
 changed once written, so a run is resumed by cutting every stream back to the length its
-checkpoint names. Files are read through memory maps: the page cache holds what was read last and
-gives it back under pressure, so the process does not grow with the replay.
+checkpoint names. The oldest may be deleted: their disk space is given back, while files keep
+their lengths and later records their places. Files are read through memory maps: the page cache
+holds what was read last and gives it back under pressure, so the process does not grow with the
+replay.
 
 Axis letters: P population member, K task, T steps in a phase, B batch, L sequence length,
 A action. Images are uint8 [height, width, 3] with height = width = `image_size`.
@@ -14,17 +16,22 @@ A action. Images are uint8 [height, width, 3] with height = width = `image_size`
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from dreamer_jax.files import explained, read_json, write_json_atomically
+from dreamer_jax.holes import free_beginning
 from dreamer_jax.prefetch import Prefetcher
+from dreamer_jax.sampling import sample_indices
 
 Batch = dict[str, np.ndarray]
 _HEADER = "replay.json"
+_DELETED = "deleted.json"
 _FORMAT = 1
 
 
@@ -41,52 +48,6 @@ def record_dtype(image_size: int, action_size: int) -> np.dtype:
     )
 
 
-def sample_indices(
-    seed: int,
-    update: int,
-    lengths: Sequence[int],
-    batch: int,
-    length: int,
-    keep: int | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where the sequences of one member's batch begin: a pure function of the arguments.
-
-    Every row draws a stream uniformly among those with at least `length` records, whatever their
-    lengths, then a start uniformly among the starts that keep the sequence inside the stream.
-
-    Args:
-        seed: the member's seed, not negative.
-        update: the number of the update, not negative.
-        lengths: [K] records in each of the member's streams.
-        batch: B.
-        length: L.
-        keep: only the newest `keep` records of each stream are sampled; None for all.
-
-    Returns:
-        tasks int64 [B] and starts int64 [B], starts counted from the first record of the stream.
-
-    Raises:
-        ValueError: no stream holds L records (within `keep`).
-    """
-    if batch < 1 or length < 1:
-        raise ValueError(f"batch and length must be at least 1, got {batch} and {length}")
-    if seed < 0 or update < 0:
-        raise ValueError(f"seed and update must not be negative, got {seed} and {update}")
-    lengths = np.asarray(lengths, np.int64)
-    oldest = np.zeros_like(lengths) if keep is None else np.maximum(lengths - keep, 0)
-    starts = lengths - oldest - length + 1
-    eligible = np.flatnonzero(starts > 0)
-    if not eligible.size:
-        within = "" if keep is None else f" (of which the newest {keep} are sampled)"
-        raise ValueError(
-            f"no stream is long enough for sequences of {length} records: "
-            f"the streams hold {lengths.tolist()}{within}; collect more or shorten the sequences"
-        )
-    random = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, update])))
-    tasks = eligible[random.integers(eligible.size, size=batch)]
-    return tasks, oldest[tasks] + random.integers(starts[tasks])
-
-
 class Replay:
     """The streams of P members and K tasks in one folder, created or opened.
 
@@ -100,7 +61,8 @@ class Replay:
         tasks: K.
         image_size: height and width of the images.
         action_size: A.
-        keep: sample only from the newest `keep` records of each stream; None for all.
+        keep: sample only from the newest `keep` records of each stream; None for all. The others
+            stay on the disk until `delete` is called.
 
     Raises:
         ValueError: the folder holds a replay of another layout, or `keep` is less than 1.
@@ -132,6 +94,7 @@ class Replay:
         self.dtype = record_dtype(image_size, action_size)
         self._open(layout)
         self._lengths = self._stored_lengths()
+        self._deleted = self._stored_deleted()
 
     def _open(self, layout: Mapping[str, int]) -> None:
         header = self.directory / _HEADER
@@ -171,6 +134,11 @@ class Replay:
         """Committed records of every stream: int64 [P, K], a copy."""
         return self._lengths.copy()
 
+    @property
+    def deleted(self) -> np.ndarray:
+        """How many of the oldest records of every stream are deleted: int64 [P, K], a copy."""
+        return self._deleted.copy()
+
     def _streams(self) -> Iterator[tuple[int, int]]:
         return np.ndindex(self.members, self.tasks)
 
@@ -186,6 +154,21 @@ class Replay:
                     "or start again in another folder"
                 ) from None
         return lengths
+
+    def _stored_deleted(self) -> np.ndarray:
+        path = self.directory / _DELETED
+        if not path.exists():
+            return np.zeros_like(self._lengths)
+        return np.array(read_json(path)["deleted"], np.int64)
+
+    def _set_deleted(self, deleted: np.ndarray) -> None:
+        if (deleted != self._deleted).any():
+            path = self.directory / _DELETED
+            try:
+                write_json_atomically(path, {"deleted": deleted.tolist()})
+            except OSError as error:
+                raise explained(error, f"could not write {path}", path) from error
+            self._deleted = deleted
 
     def append(self, records: Mapping[str, np.ndarray]) -> None:
         """Add a phase to every stream.
@@ -261,8 +244,8 @@ class Replay:
             lengths: integers [P, K].
 
         Raises:
-            ValueError: the shape is wrong, or a stream holds fewer records than asked for; nothing
-                is cut then.
+            ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
+                that would be sampled at these lengths are deleted; nothing is cut then.
         """
         lengths = np.asarray(lengths, np.int64)
         if lengths.shape != self._lengths.shape:
@@ -278,20 +261,66 @@ class Replay:
                     f"{lengths[stream]} were to be kept: the file does not belong to this "
                     "checkpoint or has lost data; resume from an older checkpoint"
                 )
+            needed = self._oldest_sampled(lengths)[stream]
+            if lengths[stream] > 0 and self._deleted[stream] > needed:
+                raise ValueError(
+                    f"the oldest {self._deleted[stream]} records of {self.path(*stream)} are "
+                    f"deleted, those from {needed} on were to be kept: resume from a newer "
+                    "checkpoint, or with as many records kept as before"
+                )
         self._lengths = lengths.copy()
         self._cut()
+        self._set_deleted(np.minimum(self._deleted, lengths))
+
+    def _oldest_sampled(self, lengths: np.ndarray) -> np.ndarray:
+        """Which records are the first that are sampled at these lengths: int64 [P, K]."""
+        if self.keep is None:
+            return np.zeros_like(lengths)
+        return np.maximum(lengths - self.keep, 0)
+
+    def delete(self, lengths: np.ndarray) -> None:
+        """Give back the disk space of records that are not sampled from these lengths on.
+
+        These are the ones older than the newest `keep`; without `keep` there are none. What a
+        `truncate` to `lengths` or more needs stays. Where the file system cannot free a part of
+        a file nothing is deleted, and a warning says so.
+
+        Args:
+            lengths: integers [P, K], such as those of the oldest checkpoint to which a run may
+                have to go back.
+        """
+        lengths = np.minimum(np.asarray(lengths, np.int64), self._lengths)
+        deleted = np.maximum(self._deleted, self._oldest_sampled(lengths))
+        streams = [stream for stream in self._streams() if deleted[stream] > self._deleted[stream]]
+        # Written first: what it names is never read again, whether or not it is still there.
+        self._set_deleted(deleted)
+        for stream in streams:
+            path = self.path(*stream)
+            try:
+                free_beginning(path, int(deleted[stream]) * self.dtype.itemsize)
+            except OSError as error:
+                if error.errno not in (errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS):
+                    raise explained(
+                        error, f"could not delete the oldest records of {path}", path
+                    ) from error
+                warnings.warn(
+                    f"the file system of {self.directory} cannot free a part of a file: records "
+                    "that are no longer sampled stay on the disk",
+                    stacklevel=2,
+                )
+                return
 
     def read(self, member: int, task: int, start: int, stop: int) -> Batch:
         """A copy of the records [start, stop) of one stream, by name.
 
         Raises:
-            ValueError: the range is not within the committed records.
+            ValueError: the range is not within the committed records that are not deleted.
         """
-        held = int(self._lengths[member, task])
-        if not 0 <= start <= stop <= held:
+        oldest, held = int(self._deleted[member, task]), int(self._lengths[member, task])
+        if not oldest <= start <= stop <= held:
             raise ValueError(
                 f"records [{start}, {stop}) of {self.path(member, task)} were asked for, "
-                f"it holds {held}"
+                f"it holds [{oldest}, {held})"
             )
         batch = self._empty((stop - start,))
         if stop > start:
@@ -343,7 +372,13 @@ class Replay:
         for position, (member, seed) in enumerate(zip(members, seeds, strict=True)):
             try:
                 tasks, starts = sample_indices(
-                    int(seed), update, lengths[member], batch, length, self.keep
+                    int(seed),
+                    update,
+                    lengths[member],
+                    batch,
+                    length,
+                    self.keep,
+                    self._deleted[member],
                 )
             except ValueError as error:
                 raise ValueError(f"member {member} of {self.directory}: {error}") from None

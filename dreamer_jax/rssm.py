@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from dreamer_jax.networks import Dense, Dtype, elu, glorot_uniform
+from dreamer_jax.networks import Dense, Dtype, add_bias, elu, glorot_uniform
 
 
 class LatentState(NamedTuple):
@@ -75,12 +75,10 @@ class GRU(nn.Module):
         columns = 3 * self.features
         kernel = self.param("kernel", glorot_uniform, (inputs.shape[-1], columns))
         recurrent = self.param("recurrent_kernel", orthogonal, (self.features, columns))
-        bias = self.param("bias", nn.initializers.zeros, (2, columns)).astype(self.dtype)
+        bias = self.param("bias", nn.initializers.zeros, (2, columns))
         from_inputs = inputs.astype(self.dtype) @ kernel.astype(self.dtype) + bias[0]
         from_hidden = hidden.astype(self.dtype) @ recurrent.astype(self.dtype) + bias[1]
-        gates, recurrent_gates = (
-            jnp.split(x.astype(jnp.float32), 3, axis=-1) for x in (from_inputs, from_hidden)
-        )
+        gates, recurrent_gates = (jnp.split(x, 3, axis=-1) for x in (from_inputs, from_hidden))
         update = jax.nn.sigmoid(gates[0] + recurrent_gates[0])
         reset = jax.nn.sigmoid(gates[1] + recurrent_gates[1])
         candidate = jnp.tanh(gates[2] + reset * recurrent_gates[2])
@@ -104,7 +102,7 @@ class JoinedDense(nn.Module):
     def project(self, second: jax.Array) -> jax.Array:
         """The second input's share and the bias: [..., sizes[1]] -> [..., features]."""
         kernel = self.kernel[self.sizes[0] :].astype(self.dtype)
-        return second.astype(self.dtype) @ kernel + self.bias.astype(self.dtype)
+        return add_bias(second.astype(self.dtype) @ kernel, self.bias)
 
     def __call__(self, first: jax.Array, projected: jax.Array) -> jax.Array:
         """[..., sizes[0]] and `project`'s [..., features] -> [..., features]."""

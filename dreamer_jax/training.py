@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer_jax.agent import Agent, AgentState, Batch
-from dreamer_jax.checkpoint import Checkpointer
+from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from dreamer_jax.logs import MetricsWriter
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Progress
@@ -117,6 +117,12 @@ class Run:
                 f"the environment takes actions of size {env.action_size}, the agent gives "
                 f"{agent.action_size}: build both for the same tasks"
             )
+        if env.discrete != agent.discrete:
+            kinds = ["discrete" if x.discrete else "continuous" for x in (env, agent)]
+            raise ValueError(
+                f"the environment takes {kinds[0]} actions, the agent gives {kinds[1]} ones: "
+                "build both for the same tasks"
+            )
         if env.image_size != config.network.image_size:
             raise ValueError(
                 f"the environment renders {env.image_size} pixels, the agent reads "
@@ -137,6 +143,7 @@ class Run:
             tasks=len(self.tasks),
             image_size=config.network.image_size,
             action_size=agent.action_size,
+            keep=config.schedule.replay_keep,
         )
         self.writer = MetricsWriter(self.directory)
         self.counters = Counters()
@@ -178,6 +185,16 @@ class Run:
             "metrics": self.writer.offset(),
         }
         self.checkpoints.save(self._step(), {"agent": self.state, "sums": self.sums}, metadata)
+        self._delete_records()
+
+    def _delete_records(self) -> None:
+        """Deletes the records that are too old for every checkpoint."""
+        checkpoints = self.checkpoints
+        try:
+            lengths = [checkpoints.metadata(step)["replay"] for step in checkpoints.steps()]
+        except CorruptCheckpointError:
+            return  # until it has been replaced
+        self.replay.delete(np.min(lengths, axis=0))
 
     def _step(self) -> int:
         """A number that grows with every action."""

@@ -1,12 +1,12 @@
-"""Pixel tasks that jitted JAX programs can step: `make`, `task_names`, `spec`.
+"""Pixel tasks that jitted JAX programs can step: `make`, `task_names`, `spec`, `specs`.
 
 Importing this package also registers the tasks with gymnasium, as `bullet_pixels/Hopper-v0` and so
 on. It imports no JAX by itself, for simulator processes import it too.
 """
 
 from envs.base import Env, SimulatorError, TaskSpec, TimeStep
-from envs.registry import make, register_gymnasium, spec, task_names
+from envs.registry import make, register_gymnasium, spec, specs, task_names
 
-__all__ = ["Env", "SimulatorError", "TaskSpec", "TimeStep", "make", "spec", "task_names"]
+__all__ = ["Env", "SimulatorError", "TaskSpec", "TimeStep", "make", "spec", "specs", "task_names"]
 
 register_gymnasium()

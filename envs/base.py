@@ -19,14 +19,15 @@ class TaskSpec:
 
     Attributes:
         name: the name in this package, `backend/task`, such as "bullet/hopper".
-        title: the name as the thesis prints it, such as "Hopper".
-        action_size: |A|, the number of continuous actions, each in [-1, 1].
+        title: the name as it is printed, such as "Hopper".
+        action_size: |A|, the number of continuous actions, each in [-1, 1], or of choices.
         simulator: where to find its `Simulator`, as "module:callable"; it is called with
             (title, image_size).
         gymnasium_id: the id under which `gymnasium.make` finds the same task.
         action_repeat: environment steps for which one action is held, unless told otherwise.
         time_limit: length of an episode in environment steps (not in actions).
         step_seconds: simulated time of one environment step, in seconds.
+        discrete: whether an action is one of |A| choices, given as a one-hot vector.
     """
 
     name: str
@@ -37,6 +38,7 @@ class TaskSpec:
     action_repeat: int = 2
     time_limit: int = 1000
     step_seconds: float = 0.0165
+    discrete: bool = False
 
 
 class TimeStep(NamedTuple):
@@ -46,7 +48,7 @@ class TimeStep(NamedTuple):
         image: uint8 [height, width, 3], after the tick.
         reward: float32 [], summed over the action repeat; 0 on a reset.
         first: bool [], True if this tick was a reset.
-        terminal: bool [], True if the episode ended by falling; never by a time limit.
+        terminal: bool [], True if the episode ended by itself; never by a time limit.
     """
 
     image: Any
@@ -60,9 +62,10 @@ class Env(Protocol):
 
     An environment holds a number of slots, one simulator each. For a population of P members
     and K tasks, slot = member * K + task. After a terminal tick the next `step` ignores its
-    action and starts a new episode (`first` is True, the reward 0). No time limit applies: the
-    caller runs a phase for as many ticks as it wants, and starts the next one with `reset`.
-    Everything from one `reset` to the next is a function of its key and the actions alone.
+    action and starts a new episode (`first` is True, the reward 0); so it does where a simulator
+    with a time limit of its own cuts an episode, which no tick calls terminal. No other time limit
+    applies: the caller runs a phase for as many ticks as it wants, and starts the next one with
+    `reset`. Everything from one `reset` to the next is a function of its key and the actions alone.
 
     Attributes:
         action_size: A, the largest |A| of the tasks; smaller tasks read their first |A| entries.
@@ -118,7 +121,8 @@ class Simulator(Protocol):
         ...
 
     def step(self, action: np.ndarray) -> Outcome:
-        """Advance by one environment step with `action` (float [|A|], clipped to [-1, 1])."""
+        """Advance by one environment step with `action` (float [|A|], clipped to [-1, 1]; of a
+        discrete task the index of the largest entry is the choice)."""
         ...
 
     def render(self) -> np.ndarray:

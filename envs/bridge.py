@@ -76,15 +76,13 @@ class HostEnv:
     """An `Env` over simulators that live in worker processes.
 
     Args:
-        tasks: K tasks; slot s plays tasks[s % K].
+        tasks: K tasks, all continuous or all discrete; slot s plays tasks[s % K].
         members: P; there are P * K slots.
         image_size: height and width of the images in pixels.
         action_repeat: environment steps for which an action is held.
         action_size: A, at least the largest |A| of the tasks.
         workers: number of worker processes, by default min(cores, slots).
     """
-
-    discrete = False
 
     def __init__(
         self,
@@ -100,6 +98,7 @@ class HostEnv:
         self.image_size = image_size
         self.action_repeat = action_repeat
         self.action_size = action_size
+        self.discrete = self.tasks[0].discrete
         self._error: BaseException | None = None
         self._ticks = np.full(members * len(self.tasks), -1, np.int32)
         self._pool = SimulatorPool(
@@ -130,7 +129,7 @@ class HostEnv:
         return _time_step(slot, *self._call_reset(_words(slot, key)))
 
     def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
-        """One tick with `action` (float32 [A], clipped to [-1, 1])."""
+        """One tick with `action` (float32 [A], clipped to [-1, 1], or one-hot)."""
         if action.shape != (self.action_size,):
             raise ValueError(
                 f"got an action of shape {action.shape}, expected {(self.action_size,)}: "

@@ -215,8 +215,10 @@ def _start(tasks: dict[int, TaskSpec], memory_descriptor: int) -> _Worker:
             stdout=output,
             stderr=output,
             pass_fds=(theirs.fileno(), memory_descriptor),
+            env={"SDL_VIDEODRIVER": "dummy"}  # pictures are drawn where there is no display too
+            | os.environ
             # Simulators are not sped up by threads, and there is one process for each core.
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+            | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
             # A group of its own, so that the terminal's Ctrl-C does not reach it while it starts.
             process_group=0,
         )

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import gymnasium
 
 from envs.base import Env, TaskSpec
+from envs.gymnasium_simulator import gymnasium_task
 
 
 def _bullet(name: str, title: str, action_size: int) -> TaskSpec:
@@ -35,11 +36,12 @@ _TASKS = {
 
 # The `Env` of each backend, by the first part of a task's name. Named, not imported: JAX stays
 # out of simulator processes, and a backend's packages need not be installed unless it is used.
-_BACKENDS = {"bullet": "envs.bridge:HostEnv"}
+_BACKENDS = {"bullet": "envs.bridge:HostEnv", "gymnasium": "envs.bridge:HostEnv"}
 
 
 def task_names() -> tuple[str, ...]:
-    """The names of all tasks, installed or not."""
+    """The names of the tasks of this package, installed or not. Beside them, `gymnasium/ID` is
+    the gymnasium environment of that id."""
     return tuple(_TASKS)
 
 
@@ -47,13 +49,38 @@ def spec(name: str) -> TaskSpec:
     """What is known of the task called `name`.
 
     Raises:
-        ValueError: if there is no such task; the message lists those there are.
+        ValueError: if there is no such task, with those there are; or if a gymnasium environment
+            has no images or no fitting actions.
+        ModuleNotFoundError: if a gymnasium environment needs a package that is not installed.
     """
     if name in _TASKS:
         return _TASKS[name]
+    backend, _, id = name.partition("/")
+    if backend == "gymnasium" and id:
+        return gymnasium_task(id)
     near = difflib.get_close_matches(name, _TASKS)
     hint = f" Did you mean {' or '.join(near)}?" if near else ""
-    raise ValueError(f"unknown task {name!r}, expected one of {', '.join(_TASKS)}.{hint}")
+    raise ValueError(
+        f"unknown task {name!r}, expected one of {', '.join(_TASKS)}, or gymnasium/ID.{hint}"
+    )
+
+
+def specs(names: Sequence[str]) -> tuple[TaskSpec, ...]:
+    """What is known of the tasks that one agent is to play.
+
+    Raises:
+        ValueError: if one is unknown (see `spec`), or some are continuous and others discrete.
+        ModuleNotFoundError: see `spec`.
+    """
+    tasks = tuple(spec(name) for name in names)
+    discrete = [task.name for task in tasks if task.discrete]
+    if 0 < len(discrete) < len(tasks):
+        continuous = [task.name for task in tasks if not task.discrete]
+        raise ValueError(
+            f"the actions of {', '.join(discrete)} are discrete, those of {', '.join(continuous)} "
+            "continuous: an agent's tasks must all be of one kind"
+        )
+    return tasks
 
 
 def make(
@@ -80,12 +107,12 @@ def make(
     """
     if isinstance(tasks, str):
         raise ValueError(f"got the string {tasks!r}, expected a list of tasks such as [{tasks!r}]")
-    specs = [spec(name) for name in tasks]
-    backends = sorted({name.partition("/")[0] for name in tasks})
-    if len(backends) != 1:
+    known = specs(tasks)
+    makers = {_BACKENDS[name.partition("/")[0]] for name in tasks}
+    if len(makers) != 1:
         raise ValueError(
-            f"got tasks {list(tasks)} of backends {backends}, expected at least one task, and "
-            "all of one backend"
+            f"got tasks {list(tasks)}, expected at least one task, and all of backends that run "
+            "together"
         )
     numbers = dict(members=members, image_size=image_size, action_repeat=action_repeat)
     if workers is not None:
@@ -93,15 +120,15 @@ def make(
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"got {name}={number}, expected at least 1")
-    largest = max(task.action_size for task in specs)
+    largest = max(task.action_size for task in known)
     if action_size is not None and action_size < largest:
         raise ValueError(
             f"got action_size={action_size}, but of the tasks {list(tasks)} the largest needs "
             f"{largest}"
         )
-    make_env = pkgutil.resolve_name(_BACKENDS[backends[0]])
+    make_env = pkgutil.resolve_name(makers.pop())
     return make_env(
-        specs, members, image_size, action_repeat, action_size or largest, workers=workers
+        known, members, image_size, action_repeat, action_size or largest, workers=workers
     )
 
 

@@ -58,7 +58,7 @@ class Phase:
     """Episodes one after another in one simulator, from one `reset` to the next.
 
     A phase begins with a simulator made anew, so that nothing before it matters. Within it, an
-    episode follows a fall in the same simulator, which is a hundred times faster; the history
+    episode follows the last in the same simulator, which is a hundred times faster; the history
     it inherits is a function of the phase's key and actions, and so is the whole phase.
     """
 
@@ -89,7 +89,7 @@ class Phase:
         if self._ended:
             return self._start_episode()
         outcome = self._simulator.step(action)
-        self._ended = outcome.terminal
+        self._ended = outcome.terminal or outcome.truncated
         return TimeStep(self._simulator.render(), outcome.reward, False, outcome.terminal)
 
     def close(self) -> None:
@@ -134,6 +134,16 @@ def _make_simulator(task: TaskSpec, settings: WorkerSettings) -> Simulator:
     return ActionPadding(ActionRepeat(simulator, settings.action_repeat), task.action_size)
 
 
+def _try(task: TaskSpec, settings: WorkerSettings) -> None:
+    """Starts an episode and looks at it, so that what is not installed is known at once."""
+    simulator = _make_simulator(task, settings)
+    try:
+        simulator.reset(0)
+        simulator.render()
+    finally:
+        simulator.close()
+
+
 def main(connection_descriptor: int, memory_descriptor: int) -> None:
     """Serve the pool at the other end of the socket; returns when it is gone."""
     # Ctrl-C is for the process that trains, which ends its phase with our help.
@@ -142,8 +152,8 @@ def main(connection_descriptor: int, memory_descriptor: int) -> None:
     connection = Connection(connection_descriptor)
     settings: WorkerSettings = connection.recv()
     try:
-        for task in settings.tasks.values():
-            pkgutil.resolve_name(task.simulator)  # imports the simulators' packages
+        for task in set(settings.tasks.values()):
+            _try(task, settings)
     except Exception as error:
         connection.send((0, (pickle.dumps(error), traceback.format_exc())))
         return

@@ -30,7 +30,8 @@ class Train:
     """
 
     task: tuple[str, ...]
-    """Names of the tasks, such as bullet/hopper (an unknown name lists them all)."""
+    """Names of the tasks, such as bullet/hopper (an unknown name lists them all), or gymnasium/ID
+    for any gymnasium environment with images, such as gymnasium/CartPole-v1."""
     out: Path
     """The results folder."""
     seeds: tuple[int, ...] = (0,)
@@ -239,7 +240,8 @@ def _evaluate(command: Evaluate) -> int:
     write_json_atomically(command.directory / "evaluation.json", {"episodes": rows})
     print(f"episodes: {command.directory / 'evaluation.json'}")
     if command.video:
-        for path in sorted((command.directory / "videos").glob("*_bullet_*.mp4")):
+        videos = command.directory / "videos"
+        for path in sorted([*videos.glob("evaluate_*.mp4"), *videos.glob("prediction_*.mp4")]):
             print(f"video: {path}")
     return 0
 

@@ -3,6 +3,7 @@
 Axis letters: P population member, K task, T records, L frames of a prediction.
 """
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -138,7 +139,7 @@ def write_videos(
     folder, paths = Path(directory) / "videos", []
     members = range(min(SHOWN_MEMBERS, len(spec.members)))
     for k, task in enumerate(spec.tasks):
-        name = task.replace("/", "_")
+        name = re.sub(r"[^\w.-]", "_", task)
         frames = records.image[: len(members), k]
         paths.append(write_video(folder / f"evaluate_{name}.mp4", tile(frames), fps=30))
         longest = [_longest_episode(Records(*(x[p, k] for x in records))) for p in members]

@@ -55,9 +55,9 @@ class RunSpec:
     baseline: bool = False
 
     def __post_init__(self):
-        _require(self.tasks, "no task given: choose from " + ", ".join(envs.task_names()))
-        for name in self.tasks:
-            envs.spec(name)
+        choices = ", ".join([*envs.task_names(), "gymnasium/ID"])
+        _require(self.tasks, f"no task given: choose from {choices}")
+        envs.specs(self.tasks)
         _require(len(set(self.tasks)) == len(self.tasks), f"a task is named twice: {self.tasks}")
         _require(self.seeds, "no seed given")
         _require(len(set(self.seeds)) == len(self.seeds), f"a seed is named twice: {self.seeds}")
@@ -125,7 +125,7 @@ def read_spec(directory: str | Path) -> RunSpec:
 
 
 def _versions() -> dict[str, str]:
-    names = ("jax", "jaxlib", "flax", "optax", "numpy", "gymnasium", "pybullet")
+    names = ("jax", "jaxlib", "flax", "optax", "numpy", "gymnasium", "pybullet", "pygame", "pillow")
     versions = {"python": platform.python_version(), "backend": jax.default_backend()}
     for name in names:
         try:
@@ -137,7 +137,7 @@ def _versions() -> dict[str, str]:
 
 def action_size(tasks: tuple[str, ...]) -> int:
     """A of an agent for several tasks: the largest of theirs (equation 18)."""
-    return max(envs.spec(name).action_size for name in tasks)
+    return max(task.action_size for task in envs.specs(tasks))
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,8 @@ def make_run(
 
 def make_agent(spec: RunSpec) -> Agent:
     """The functions of a run's agents."""
-    return Agent(spec.config, action_size(spec.tasks))
+    discrete = envs.specs(spec.tasks)[0].discrete
+    return Agent(spec.config, action_size(spec.tasks), discrete)
 
 
 def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:

@@ -68,6 +68,39 @@ class Probe:
         pass
 
 
+class Walk(Probe):
+    """Five cells in a row, shown as a bright column; a choice steps left, not at all, or right.
+
+    Arriving in the middle cell, or staying there, is worth 1. The best policy goes there and
+    stays, so that a state d cells away has the value discount^d / (1 - discount), its own reward
+    counted.
+    """
+
+    discrete = True
+    cells, middle = 5, 2
+
+    def __init__(self, image_size=32):
+        super().__init__(action_size=3, image_size=image_size, falls=False)
+
+    def _time_step(self, cell, reward, first):
+        image = self._image((2 * cell + 1) / self.cells - 1)
+        return TimeStep(image, jnp.float32(reward), jnp.bool_(first), jnp.bool_(False))
+
+    def reset(self, slot, key):
+        cell = jax.random.randint(key, (), 0, self.cells)
+        return cell, self._time_step(cell, 0.0, True)
+
+    def step(self, state, action):
+        cell = jnp.clip(state + jnp.argmax(action) - 1, 0, self.cells - 1)
+        return cell, self._time_step(cell, cell == self.middle, False)
+
+    @classmethod
+    def cell_of(cls, image):
+        """Which cell images show: uint8 [..., size, size, 3] -> int [...]."""
+        column = image[..., 0, :, 0].argmax(-1)
+        return column * cls.cells // image.shape[-2]
+
+
 class BrokenProbe(Probe):
     """A probe whose simulators report an error after a given number of phases."""
 

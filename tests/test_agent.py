@@ -231,6 +231,52 @@ def test_imagination_from_fewer_states_costs_less(agent):
     assert matrix_products(fewer) < matrix_products(agent) * 4 / (B * L)
 
 
+def with_termination_logit(params, logit):
+    """Parameters whose termination head answers `logit` whatever it reads."""
+    out = params["termination"]["out"]
+    constant = {"kernel": 0 * out["kernel"], "bias": jnp.full_like(out["bias"], logit)}
+    return params | {"termination": params["termination"] | {"out": constant}}
+
+
+def test_the_termination_heads_target_is_the_discount_and_its_scale_ten():
+    agent = Agent(with_settings("network", termination=True), A)
+    params = with_termination_logit(agent.init_params(jax.random.key(0)), 1.5)
+    batch = batch_of()
+    batch.terminal[0, :3] = True  # 3 of 10 records
+    _, (_, metrics) = jax.jit(lambda p: agent.model_loss({}, p, batch, jax.random.key(1)))(params)
+    # Cross-entropy of sigmoid(1.5) with targets 0 (terminal) and 0.99 (the others).
+    p = 1 / (1 + np.exp(-1.5))
+    going_on = -0.99 * np.log(p) - 0.01 * np.log(1 - p)
+    expected = (3 * -np.log(1 - p) + 7 * going_on) / 10
+    assert_allclose(metrics["termination_loss"], expected, rtol=1e-5)
+    rest = metrics["image_loss"] + metrics["reward_loss"] + max(3.0, metrics["kl"])
+    assert_allclose(metrics["model_loss"] - rest, 10 * expected, rtol=1e-3)
+
+
+def test_imagination_weighs_what_follows_by_the_termination_head():
+    agent, plain = Agent(with_settings("network", termination=True), A), Agent(CONFIG, A)
+    params = agent.init_params(jax.random.key(0))
+    start = plain.dynamics.initial((B, L))
+
+    def imagined(some, params):
+        loss = jax.jit(lambda p: some.actor_loss({}, p, start, jax.random.key(1)))
+        return loss(params)[1][0]
+
+    # Where every state ends the episode, a return is its reward, and only the first one counts.
+    features, returns, weights = imagined(agent, with_termination_logit(params, -100.0))
+    assert_allclose(returns, agent.reward(params, features)[:-1], rtol=1e-5)
+    assert_allclose(weights[0], 1.0)
+    assert_allclose(weights[1:], 0.0, atol=1e-30)
+    # Where none does, all is as without the head.
+    logit = np.log(0.99 / 0.01)
+    for got, expected in zip(
+        imagined(agent, with_termination_logit(params, logit)),
+        imagined(plain, params),
+        strict=True,
+    ):
+        assert_allclose(got, expected, rtol=1e-4, atol=1e-6)
+
+
 def test_a_termination_head_learns_the_discount_and_shortens_imagined_returns():
     agent = Agent(with_settings("network", termination=True), A)
     state = jax.jit(agent.init)(0)
@@ -349,16 +395,6 @@ def test_a_batch_of_another_action_size_is_refused(agent, state):
     batch = batch_of()
     with pytest.raises(AssertionError):
         agent.update(state, batch._replace(action=batch.action[..., :1]))
-
-
-def test_bfloat16_keeps_parameters_and_losses_in_float32_and_close(state):
-    agent = Agent(with_settings("network", precision="bfloat16"), A)
-    new, metrics = jax.jit(agent.update)(state, batch_of())
-    assert {x.dtype for x in jax.tree.leaves(new.params)} == {jnp.dtype("float32")}
-    assert {x.dtype for x in metrics.values()} == {jnp.dtype("float32")}
-    _, exact = jax.jit(Agent(CONFIG, A).update)(state, batch_of())
-    assert_allclose(metrics["model_loss"], exact["model_loss"], rtol=0.02)
-    assert_allclose(metrics["value_loss"], exact["value_loss"], rtol=0.3, atol=0.05)
 
 
 def test_predictions_see_the_context_and_nothing_of_what_follows(agent, state):

@@ -117,6 +117,20 @@ def test_evaluation_prints_a_row_per_agent_and_repeats_itself(whole):
     assert "prediction_bullet_inverted_pendulum.mp4" in output
 
 
+def test_a_gymnasium_environment_with_choices_is_trained_on_by_its_id(tmp_path, capsys):
+    pytest.importorskip("pygame")
+    directory = tmp_path / "cartpole"
+    words = ["--task", "gymnasium/CartPole-v1", "--preset", "debug", "--termination"]
+    assert main(["train", *words, "--action-repeat", "1", "--out", str(directory)]) == 0
+    rows = [row for row in read_metrics(directory) if row["kind"] == "evaluation"]
+    # A step is worth 1 until the pole has fallen.
+    assert len(rows) == 4 and all(row["return"] == row["length"] for row in rows)
+    assert all(row["fell"] or row["length"] == 40 for row in rows)
+    assert main(["evaluate", str(directory), "--episodes", "1", "--video"]) == 0
+    output = capsys.readouterr().out.replace("\n", "")
+    assert f"{directory}/videos/evaluate_gymnasium_CartPole-v1.mp4" in output
+
+
 def test_a_report_says_that_a_run_is_incomplete(whole, tmp_path, capsys):
     shutil.copytree(whole, tmp_path / "cut")
     path = tmp_path / "cut" / "metrics.jsonl"
@@ -131,6 +145,8 @@ def test_a_report_says_that_a_run_is_incomplete(whole, tmp_path, capsys):
     [
         (["--task", "bullet/hoper"], "Did you mean bullet/hopper"),
         (["--task", "hopper"], "expected one of bullet/ant"),
+        (["--task", "gymnasium/CartPol-v1"], "Did you mean gymnasium/CartPole-v1"),
+        (["--task", "bullet/hopper", "gymnasium/CartPole-v1"], "must all be of one kind"),
         (["--preset", "thsis"], "did you mean 'thesis'"),
         (["--seeds", "1", "1"], "a seed is named twice"),
         (["--omega", "0.2"], "add --source DIR"),

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import sys
 import threading
 import time
 from collections import Counter
@@ -13,7 +14,8 @@ from hypothesis import strategies as st
 
 from dreamer_jax import replay as replay_module
 from dreamer_jax.prefetch import Prefetcher
-from dreamer_jax.replay import Replay, sample_indices
+from dreamer_jax.replay import Replay
+from dreamer_jax.sampling import sample_indices
 
 SIZE, ACTION = 8, 2
 
@@ -330,6 +332,101 @@ def test_seeds_and_members_must_match(tmp_path):
         make(tmp_path).sample([0, 1, 2], 0, 4, 5)
 
 
+# --- deleting the oldest --------------------------------------------------------------------------
+
+needs_holes = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's fallocate")
+BLOCK = 4096
+
+
+def disk_use(replay):
+    """Bytes on the disk of the first stream, however long its file says it is."""
+    return replay.path(0, 0).stat().st_blocks * 512
+
+
+@needs_holes
+def test_deleting_gives_disk_space_back_and_leaves_what_is_sampled(tmp_path):
+    replay = make(tmp_path, steps=[2000], keep=50)
+    size, before = replay.dtype.itemsize, replay.sample([3, 4], 0, 5, 20)
+    kept = replay.read(1, 1, 1950, 2000)
+    assert disk_use(replay) >= 2000 * size
+    replay.delete(replay.lengths)
+    assert disk_use(replay) <= 50 * size + 2 * BLOCK
+    assert (replay.deleted == 1950).all() and (replay.lengths == 2000).all()
+    assert_same(replay.sample([3, 4], 0, 5, 20), before)
+    assert_same(replay.read(1, 1, 1950, 2000), kept)
+    with pytest.raises(ValueError, match=r"\[1949, 2000\).*it holds \[1950, 2000\)"):
+        replay.read(1, 1, 1949, 2000)
+
+
+@needs_holes
+def test_a_stream_that_grows_and_grows_stays_small_on_the_disk(tmp_path):
+    replay, lengths = make(tmp_path, steps=[500], keep=100), None
+    for start in range(500, 5000, 500):
+        lengths = replay.lengths  # what a checkpoint would name
+        replay.append(phase(2, 2, 500, start=start))
+        replay.delete(lengths)
+        assert disk_use(replay) <= (100 + 500) * replay.dtype.itemsize + 2 * BLOCK
+    assert replay.path(0, 0).stat().st_size == 5000 * replay.dtype.itemsize
+
+
+@pytest.mark.parametrize("opened_again", [False, True])
+def test_a_run_that_goes_back_finds_all_it_sampled_then(tmp_path, opened_again):
+    replay = make(tmp_path / "cut", steps=[200], keep=60)
+    lengths, before = replay.lengths, replay.sample([0, 1], 5, 40, 30)
+    replay.append(phase(2, 2, 150, start=200))
+    replay.delete(lengths)
+    if opened_again:
+        replay = make(tmp_path / "cut", steps=[], keep=60)
+    replay.truncate(lengths)
+    assert_same(replay.sample([0, 1], 5, 40, 30), before)
+    replay.append(phase(2, 2, 150, start=200))
+    whole = make(tmp_path / "whole", steps=[200, 150], keep=60)
+    assert_same(replay.sample([0, 1], 6, 40, 30), whole.sample([0, 1], 6, 40, 30))
+
+
+def test_going_back_to_where_deleted_records_were_sampled_is_refused(tmp_path):
+    replay = make(tmp_path, steps=[200], keep=60)
+    replay.delete(replay.lengths)
+    with pytest.raises(ValueError, match="oldest 140 records .* those from 139 on were to be kept"):
+        replay.truncate(replay.lengths - 1)
+    assert (replay.lengths == 200).all()
+    with pytest.raises(ValueError, match="oldest 140 records .* those from 0 on"):
+        make(tmp_path, steps=[]).truncate(replay.lengths)
+    # Nothing at all is needed by a run that starts again.
+    replay.truncate(np.zeros((2, 2), int))
+    replay.append(phase(2, 2, 70))
+    assert_same(replay.read(0, 0, 0, 70), {n: x[0, 0] for n, x in phase(2, 2, 70).items()})
+
+
+def test_a_replay_opened_without_a_limit_never_samples_what_is_deleted(tmp_path):
+    replay = make(tmp_path, steps=[200], keep=60)
+    replay.delete(replay.lengths)
+    everything = make(tmp_path, steps=[])
+    times = everything.sample([0, 1], 0, 50, 20)["reward"] % 10**4
+    assert times.min() >= 140 and times.max() <= 199
+
+
+@pytest.mark.parametrize("keep", [None, 60])
+def test_nothing_is_deleted_without_a_limit_or_below_it(tmp_path, keep):
+    replay = make(tmp_path, steps=[50], keep=keep)
+    before = files(tmp_path)
+    replay.delete(replay.lengths)
+    assert files(tmp_path) == before and not replay.deleted.any()
+
+
+def test_where_files_cannot_have_holes_a_warning_says_so_and_all_goes_on(tmp_path, monkeypatch):
+    def unable(path, size):
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    monkeypatch.setattr(replay_module, "free_beginning", unable)
+    replay = make(tmp_path, steps=[200], keep=60)
+    before, stored = replay.sample([0, 1], 5, 4, 30), files(tmp_path)
+    with pytest.warns(UserWarning, match="no longer sampled stay on the disk"):
+        replay.delete(replay.lengths)
+    assert files(tmp_path) == stored
+    assert_same(replay.sample([0, 1], 5, 4, 30), before)
+
+
 # --- memory ---------------------------------------------------------------------------------------
 
 
@@ -354,25 +451,25 @@ def anonymous_bytes():
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux's /proc")
 def test_memory_does_not_grow_with_the_replay(tmp_path):
-    replay = Replay(tmp_path, 1, 1, 64, ACTION)
+    # A million environment steps of three members, 18 GB, may take 4 GiB: here a hundredth.
+    replay = Replay(tmp_path, 3, 1, 64, ACTION)
     steps = 500
     records = {
-        "image": np.ones((1, 1, steps, 64, 64, 3), np.uint8),
-        "action": np.ones((1, 1, steps, ACTION), np.float32),
-        "reward": np.ones((1, 1, steps), np.float32),
-        "first": np.zeros((1, 1, steps), bool),
-        "terminal": np.zeros((1, 1, steps), bool),
+        "image": np.ones((3, 1, steps, 64, 64, 3), np.uint8),
+        "action": np.ones((3, 1, steps, ACTION), np.float32),
+        "reward": np.ones((3, 1, steps), np.float32),
+        "first": np.zeros((3, 1, steps), bool),
+        "terminal": np.zeros((3, 1, steps), bool),
     }
     replay.append(records)
-    replay.sample([0], 0, 10, 50)
+    replay.sample([0, 1, 2], 0, 4, 50)
     before = anonymous_bytes()
-    for _ in range(15):
+    while replay.lengths[0, 0] < 5000:
         replay.append(records)
-    for update in range(30):
-        replay.sample([0], update, 10, 50)
-    stored = replay.path(0, 0).stat().st_size
-    assert stored > 95e6
-    assert anonymous_bytes() - before < stored / 4
+    for update in range(20):
+        replay.sample([0, 1, 2], update, 4, 50)
+    assert replay.path(2, 0).stat().st_size > 60e6
+    assert anonymous_bytes() - before < 4 * 2**30 / 100
 
 
 # --- prefetching ----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import BrokenProbe, Probe
+from probes import BrokenProbe, Probe, Walk
 
 from dreamer_jax import config as configs
 from dreamer_jax import training
@@ -166,11 +166,8 @@ class Killed(BaseException):
     """Stands for what ends a process without letting it save."""
 
 
-@pytest.mark.parametrize("updates", [1, 4, 7])
-def test_a_run_killed_between_checkpoints_and_resumed_equals_one_that_was_not(
-    finished, tmp_path, updates, monkeypatch
-):
-    directory, whole = finished
+def killing_after(updates):
+    """What takes the place of `update_members` to kill a run after some updates."""
     original, left = training.update_members, [updates]
 
     def killing(*arguments, **options):
@@ -179,14 +176,44 @@ def test_a_run_killed_between_checkpoints_and_resumed_equals_one_that_was_not(
             raise Killed
         return original(*arguments, **options)
 
+    return killing
+
+
+@pytest.mark.parametrize("updates", [1, 4, 7])
+def test_a_run_killed_between_checkpoints_and_resumed_equals_one_that_was_not(
+    finished, tmp_path, updates, monkeypatch
+):
+    directory, whole = finished
     run = run_in(tmp_path)
-    monkeypatch.setattr(training, "update_members", killing)
+    monkeypatch.setattr(training, "update_members", killing_after(updates))
     with pytest.raises(Killed):
         run.train()
     run.close()
     monkeypatch.undo()
     resumed, _ = trained(tmp_path, resume=True)
     metrics = [(folder / "metrics.jsonl").read_bytes() for folder in (directory, tmp_path)]
+    assert metrics[0] == metrics[1]
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_run_that_deletes_old_records_and_is_killed_goes_on_as_if_it_had_not_been(
+    tmp_path, monkeypatch
+):
+    # Four phases of 21 records each; checkpoints name the lengths after the third and the last.
+    schedule = dataclasses.replace(CONFIG.schedule, replay_keep=25)
+    options = {"agent": Agent(dataclasses.replace(CONFIG, schedule=schedule), 2)}
+    whole, _ = trained(tmp_path / "whole", **options)
+    assert (whole.replay.lengths == 84).all() and (whole.replay.deleted == 63 - 25).all()
+
+    killed = run_in(tmp_path / "killed", **options)
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "update_members", killing_after(7))
+        with pytest.raises(Killed):
+            killed.train()
+    killed.close()
+    assert killed.replay.deleted.any()
+    resumed, _ = trained(tmp_path / "killed", resume=True, **options)
+    metrics = [(tmp_path / name / "metrics.jsonl").read_bytes() for name in ("whole", "killed")]
     assert metrics[0] == metrics[1]
     chex.assert_trees_all_equal(resumed.state, whole.state)
 
@@ -216,16 +243,47 @@ def test_a_simulator_that_dies_ends_the_run_with_everything_before_it_saved(fini
     assert (tmp_path / "metrics.jsonl").read_bytes() == (directory / "metrics.jsonl").read_bytes()
 
 
-def test_a_member_that_turns_not_finite_is_named_and_the_others_finish(tmp_path, capsys):
+def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_without_it(
+    finished, tmp_path, capsys, monkeypatch
+):
+    directory, whole = finished
+    original, updates = training.update_members, []
+
+    def poisoning(agent, state, sums, batch, **options):
+        updates.append(jax.tree.map(lambda x: np.array(x[1]), state.params))
+        if len(updates) == 4:
+            reward = batch.reward.copy()
+            reward[1, 0, 0] = np.nan
+            batch = batch._replace(reward=reward)
+        return original(agent, state, sums, batch, **options)
+
+    monkeypatch.setattr(training, "update_members", poisoning)
+    run, outcome = trained(tmp_path)
+    assert outcome == "finished" and len(updates) == 8
+    message = " ".join(capsys.readouterr().out.split())
+    assert "member 1 (two, seed 7) met a loss or gradient that is not finite by update 4" in message
+
+    rows, others = ([r for r in read_metrics(d)] for d in (tmp_path, directory))
+    assert [r for r in rows if r["member"] == 0] == [r for r in others if r["member"] == 0]
+    healthy = [r["healthy"] for r in rows if r["member"] == 1 and r["kind"] == "update"]
+    assert healthy == [True, False, False, False]
+    # Bit for bit: the one as in the run without an accident, the other as before its own.
+    first, second = (jax.tree.map(lambda x, p=p: x[p], run.state) for p in range(2))
+    chex.assert_trees_all_equal(first, jax.tree.map(lambda x: x[0], whole.state))
+    chex.assert_trees_all_equal(second.params, updates[3])
+    assert not second.healthy and second.updates == 8
+
+
+def test_a_member_that_was_frozen_stays_so_when_the_run_is_resumed(tmp_path, capsys):
     run = run_in(tmp_path)
     poisoned = run.state.params["reward"]["out"]["bias"].at[1].set(jnp.nan)
     run.state.params["reward"]["out"]["bias"] = poisoned
-    assert run.train() == "finished"
-    run.close()
+    assert stop_after(run, 3) == "stopped"
     assert "member 1 (two, seed 7)" in capsys.readouterr().out
-    rows = [row for row in read_metrics(tmp_path) if row["kind"] == "update"]
-    assert [row["healthy"] for row in rows if row["member"] == 0] == [True] * 4
-    assert [row["healthy"] for row in rows if row["member"] == 1] == [False] * 4
+    resumed, outcome = trained(tmp_path, resume=True)
+    assert outcome == "finished"
+    assert "is not finite" not in capsys.readouterr().out, "it was reported before"
+    np.testing.assert_array_equal(resumed.state.healthy, [True, False])
 
 
 def test_a_run_without_a_healthy_member_ends_with_a_clear_error(tmp_path):
@@ -241,11 +299,13 @@ def test_an_environment_of_other_sizes_is_refused_naming_both(tmp_path):
         run_in(tmp_path, env=Probe(action_size=3))
     with pytest.raises(ValueError, match="renders 64 pixels, the agent reads 32"):
         run_in(tmp_path, env=Probe(image_size=64))
+    with pytest.raises(ValueError, match="takes continuous actions, the agent gives discrete"):
+        run_in(tmp_path, agent=Agent(CONFIG, 2, discrete=True))
 
 
-def test_the_probe_is_solved_in_seconds(tmp_path):
-    # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
-    config = dataclasses.replace(
+def learning_config():
+    """Small networks and 1200 updates, which are enough to solve a probe."""
+    return dataclasses.replace(
         CONFIG,
         network=dataclasses.replace(CONFIG.network, head_units=32, hidden_size=32),
         learning=dataclasses.replace(
@@ -267,10 +327,36 @@ def test_the_probe_is_solved_in_seconds(tmp_path):
             checkpoint_every=2000,
         ),
     )
+
+
+def test_the_probe_is_solved_in_seconds(tmp_path):
+    # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
+    config = learning_config()
     agent, env = Agent(config, 2), Probe(falls=False)
     trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
     score = [row for row in read_metrics(tmp_path) if row["kind"] == "evaluation"][-1]["return"]
     assert score > 0.8 * config.schedule.phase_ticks
+
+
+def test_discrete_choices_are_learned_with_their_values(tmp_path):
+    config = learning_config()
+    agent, env, ticks = Agent(config, 3, discrete=True), Walk(), config.schedule.phase_ticks
+    run, _ = trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
+    # From any cell the best choices lose a tick at most.
+    rows = read_metrics(tmp_path)
+    score = [row for row in rows if row["kind"] == "evaluation"][-1]["return"]
+    assert 0.8 * ticks < score <= ticks
+    random = [row["return"] for row in rows if row.get("policy") == "random"]
+    assert np.mean(random) < 0.5 * ticks
+    # Discount 0.5: values 2, 1 and 0.5 at distances 0, 1 and 2.
+    batch = Batch(**run.replay.sample([0], 10**6, 50, 8))
+    params = jax.tree.map(lambda x: x[0], run.state.params)
+    batch = jax.tree.map(lambda x: x[0], batch)
+    posterior, _, _ = jax.jit(agent.observe)(params, batch, jax.random.key(0))
+    values = np.asarray(agent.value(params, posterior.features))
+    distance = np.abs(Walk.cell_of(batch.image) - Walk.middle)
+    means = [values[~batch.first & (distance == d)].mean() for d in range(3)]
+    np.testing.assert_allclose(means, [2, 1, 0.5], atol=0.35)
 
 
 def test_a_configuration_survives_json():
@@ -289,6 +375,7 @@ def test_a_configuration_survives_json():
         (lambda: configs.LearningConfig(horizon=1), "at least 2"),
         (lambda: configs.LearningConfig(imagination_starts=0), "2500 posterior states"),
         (lambda: configs.ScheduleConfig(phase_environment_steps=5), "no multiple"),
+        (lambda: configs.Config(schedule=configs.ScheduleConfig(replay_keep=49)), "has 50 records"),
         (lambda: configs.from_dict({"network": {"image": 32}}), "unknown settings"),
     ],
 )
