@@ -34,11 +34,6 @@ def plan(spec: RunSpec) -> transfer.Plan | None:
     return meta_model(spec.dynamics, components=spec.meta, switching=spec.switching)
 
 
-def frozen_paths(chosen: transfer.Plan, tree: Any) -> list[str]:
-    """The leaves that a plan means to keep as they are in training."""
-    return [path for path, rule in transfer.claims(chosen, tree).items() if rule.frozen]
-
-
 @functools.cache
 def make_agent(spec: RunSpec) -> Agent:
     """The functions of a run's agents. What its method freezes is frozen in them."""
@@ -48,7 +43,11 @@ def make_agent(spec: RunSpec) -> Agent:
     if (chosen := plan(spec)) is None:
         return agent
     fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
-    kept = {"/".join(path.split("/")[:2]) for path in frozen_paths(chosen, fresh)}
+    kept = {
+        "/".join(path.split("/")[:2])
+        for path, rule in transfer.claims(chosen, fresh).items()
+        if rule.frozen
+    }
     learning = spec.config.learning
     learning = dataclasses.replace(learning, frozen=(*learning.frozen, *sorted(kept)))
     return dataclasses.replace(agent, config=dataclasses.replace(spec.config, learning=learning))

@@ -17,7 +17,6 @@ from experiments.agents import (
     KNOWN_SAMPLES,
     Source,
     check_source,
-    frozen_paths,
     load_source,
     make_agent,
     plan,
@@ -66,7 +65,9 @@ def _check_stored(stored: Source, agent: Source, spec: RunSpec) -> None:
         )
     flat, wanted = transfer.flatten(stored.params), transfer.flatten(agent.params)
     fresh = jax.eval_shape(make_agent(spec).init_params, jax.random.key(0))
-    for path in set(frozen_paths(plan(spec), fresh)) & set(wanted):
+    for path, rule in transfer.claims(plan(spec), fresh).items():
+        if not rule.frozen or rule.source != "autoencoder":
+            continue
         if path not in flat or not np.array_equal(flat[path], wanted[path]):
             component = path.partition("/")[0]
             option = " --dynamics frozen" if component == "dynamics" else ""

@@ -23,18 +23,25 @@ def spec_of(*tasks, seeds=(0,), config=CONFIG, **settings) -> RunSpec:
     return RunSpec(names, seeds, config, **settings)
 
 
+def random_params(agent, seed=0):
+    """Parameters of the shapes of an agent's, without compiling its initialisation."""
+    random = np.random.default_rng(seed)
+    shapes = jax.eval_shape(agent.init_params, jax.random.key(0))
+    return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
+
+
 def write_run(directory, spec: RunSpec, seed=0) -> Source:
     """A results folder of agents with random parameters, after the run's method.
 
     Returns:
       Its first agent.
     """
-    random = np.random.default_rng(seed)
-    shapes = jax.eval_shape(make_agent(spec).init_params, jax.random.key(0))
-    params = jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
+    params = random_params(make_agent(spec), seed)
     if spec.method == "uae":
         source = load_source(spec.source)
-        params, _ = transfer.apply(plan(spec), params, source.params)
+        given, claims = transfer.flatten(source.params), transfer.claims(plan(spec), params)
+        copied = [path for path, rule in claims.items() if rule.operation == "copy"]
+        params = transfer.unflatten(params, {path: given[path] for path in copied})
     params = jax.tree.map(lambda x: np.stack([x] * len(spec.members)), params)
     Checkpointer(directory / "checkpoints").save(0, {"agent": {"params": params}}, {})
     write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})

@@ -1,10 +1,12 @@
 """The methods from the command line on real PyBullet tasks, at sizes of seconds."""
 
+import dataclasses
 import json
 import shutil
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from runs import spec_of, write_run
 from transfer_trees import bits
 
@@ -12,6 +14,7 @@ from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.logs import read_metrics
 from experiments.__main__ import main
 from experiments.agents import load_source
+from experiments.methods import known_tasks, load_sources
 
 pytest.importorskip("pybullet")
 
@@ -87,19 +90,19 @@ def test_a_meta_run_is_evaluated_with_its_stored_models(runs, capsys):
 
 
 def test_a_switching_target_knows_the_tasks_of_its_sources(runs, tmp_path):
-    write_run(tmp_path / "source", spec_of(TASKS[0], "inverted_double_pendulum"))
-    on = {"method": "uae", "dynamics": "frozen", "source": tmp_path / "source"}
+    write_run(tmp_path / "source", spec_of(*TASKS))
+    on = {"dynamics": "frozen", "source": tmp_path / "source"}
     for seed, task in enumerate(TASKS, start=1):
-        write_run(tmp_path / task, spec_of(task, **on), seed)
-    train(
-        tmp_path / "target", TASKS[0], "--method", "meta", "--source", tmp_path / "source",
-        "--dynamics", "frozen", "--switching",
-        "--reward-sources", *(tmp_path / task for task in TASKS),
-    )  # fmt: skip
-    classifier = load_source(tmp_path / "target").params["reward"]["classifier"]
+        write_run(tmp_path / task, spec_of(task, method="uae", **on), seed)
+    stored = [tmp_path / task for task in TASKS]
+    spec = spec_of(TASKS[0], method="meta", reward_sources=stored, switching=True, **on)
+    classifier = known_tasks(spec, load_sources(spec).stored)
     assert np.bincount(classifier["labels"]).tolist() == [100, 100]
     assert len(np.unique(classifier["latents"], axis=0)) == 200
     assert 0 < classifier["threshold"] < np.inf
+    given = known_tasks(dataclasses.replace(spec, threshold=7.0), load_sources(spec).stored)
+    assert given["threshold"] == 7
+    assert_array_equal(given["latents"], classifier["latents"])
 
 
 def test_tasks_are_classified_and_drawn(runs, tmp_path, capsys):
