@@ -125,7 +125,7 @@ class MetaDynamics(rssm.Dynamics, kw_only=True):
         means = predictions(predict, StoredHeads(**self.stored), (state, action))
         x = self.stoch_in(state.stochastic) + self.action_in(action)
         x = x + self.stored_in(means.reshape(*means.shape[:-2], -1))
-        return self.gru(nn.elu(x), state.deterministic)
+        return self.gru(networks.elu(x), state.deterministic)
 
 
 def meta_head(head: networks.Head, *, layers: int, places: int, samples: int = 0) -> MetaHead:
