@@ -93,7 +93,7 @@ def check_request(
 
 
 def rounds(source: Source, samples: int) -> int:
-    """How often `classify` calls `report` for each agent that acts."""
+    """Phases of each task that `classify` plays, half of them to fit and half to test."""
     return 2 * phases_for(source, samples)
 
 
@@ -140,27 +140,27 @@ def classify(
         actors=actors,
         policy=policy,
     )
-    phases = phases_for(source, samples)
     players = [(actor, (task,)) for actor, task in zip(actors, tasks, strict=False)]
-    halves: list[dict[str, Latents]] = []
-    for half in range(2):
-        found: dict[str, Latents] = {}
-        for actor, played in players or [(source, tasks)]:
-            gathered = gather(
-                source,
-                played,
-                range(half * phases, (half + 1) * phases),
-                seed=seed,
-                policy=policy,
-                actor=actor,
-                features=features,
-                workers=workers,
-                report=report,
-            )
-            drawn = [latents.draw(samples, seed) for latents in gathered]
-            found |= dict(zip(played, drawn, strict=True))
-        halves.append(found)
-    fitted, tested = {task: halves[0][task] for task in known}, halves[1]
+    gathered: dict[str, Latents] = {}
+    for actor, played in players or [(source, tasks)]:
+        found = gather(
+            source,
+            played,
+            rounds(source, samples),
+            seed=seed,
+            policy=policy,
+            actor=actor,
+            features=features,
+            workers=workers,
+            report=report,
+        )
+        gathered |= dict(zip(played, found, strict=True))
+    # No episode goes from one phase on to the next, so none is in both halves.
+    drawn = {
+        task: [half.draw(samples, seed) for half in latents.halves()]
+        for task, latents in gathered.items()
+    }
+    fitted, tested = {task: drawn[task][0] for task in known}, {t: x[1] for t, x in drawn.items()}
     return _judge(tasks, known, fitted, tested, thresholds, neighbours, quantile)
 
 

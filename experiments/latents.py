@@ -39,6 +39,11 @@ class Latents(NamedTuple):
     features: np.ndarray
     episodes: np.ndarray
 
+    def halves(self) -> tuple["Latents", "Latents"]:
+        """Those of the first half of the phases, and those of the second."""
+        middle = len(self.episodes) // 2
+        return Latents(*(x[:middle] for x in self)), Latents(*(x[middle:] for x in self))
+
     def draw(self, samples: int, seed: int) -> "Latents":
         """S of them at random, each at most once."""
         chosen = np.random.default_rng(seed).permutation(len(self.episodes))[:samples]
@@ -75,7 +80,7 @@ def infer(
 def gather(
     source: Source,
     tasks: Sequence[str],
-    phases: Sequence[int],
+    phases: int,
     *,
     seed: int = 0,
     policy: Policy = "random",
@@ -89,7 +94,7 @@ def gather(
     Args:
       source: the agent that infers.
       tasks: K names.
-      phases: numbers of the phases; other numbers, other starts and actions.
+      phases: how many; each has other starts and actions.
       seed: of simulators, actions and samples.
       policy: "random" actions, or those of a "trained" agent (the mode, without noise).
       actor: the trained agent that acts; by default the source.
@@ -98,7 +103,7 @@ def gather(
       report: called after each phase.
 
     Returns:
-      Latent states, one entry per task.
+      Latent states, one entry per task, phase after phase with as many in each.
 
     Raises:
       ValueError: the tasks' actions or images are not of the agents' sizes.
@@ -116,7 +121,7 @@ def gather(
     key = jax.random.key(seed)
     found: list[list[Latents]] = [[] for _ in tasks]
     try:
-        for phase in phases:
+        for phase in range(phases):
             records = collect(
                 acting,
                 env,

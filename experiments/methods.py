@@ -173,7 +173,7 @@ def known_tasks(
     """
     latents, labels, episodes = [], [], []
     for place, source in enumerate(sources):
-        phases = range(phases_for(source, KNOWN_SAMPLES))
+        phases = phases_for(source, KNOWN_SAMPLES)
         parts = gather(source, source.spec.tasks, phases, workers=workers)
         shares = np.array_split(np.arange(KNOWN_SAMPLES), len(parts))
         for part, share in zip(parts, shares, strict=True):

@@ -1,6 +1,7 @@
 """The thesis's methods, and what lies beyond them, on whole agents."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -13,9 +14,12 @@ from transfer_trees import bits
 
 import transfer
 from dreamer_jax import rssm
+from dreamer_jax.agent import Batch
 from dreamer_jax.networks import Head
+from dreamer_jax.rollout import Records
 from experiments import methods
 from experiments.agents import make_agent, plan
+from experiments.latents import infer
 from experiments.meta_modules import recognise
 from experiments.methods import load_sources, stored_models, transferred_members
 from transfer.ltc import NOVEL
@@ -23,6 +27,16 @@ from transfer.ltc import NOVEL
 M = CONFIG.network.feature_size
 random = np.random.default_rng(0)
 FEATURES = random.normal(size=(3, 7, M)).astype(np.float32)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def apply(module, params, *inputs):
+    return module.apply({"params": params}, *inputs)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def reward_of(agent, params, features):
+    return agent.reward(params, features)
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +84,7 @@ def member(tree, p):
 def predictions(agent, sources, name="reward"):
     """What each source's own model predicts from FEATURES, float32 [N, ...]."""
     plain = usual(agent, name)
-    return [
-        plain.apply({"params": source.params[name]}, FEATURES)[..., 0] for source in sources.stored
-    ]
+    return [apply(plain, source.params[name], FEATURES)[..., 0] for source in sources.stored]
 
 
 def usual(agent, name):
@@ -126,8 +138,8 @@ def test_a_meta_model_reads_the_features_and_what_each_stored_model_predicts(fol
     read[..., :M] = FEATURES
     read[..., M : M + count] = np.stack(predictions(agent, sources), -1)
     own = {part: params["reward"][part] for part in ("hidden_0", "out")}
-    expected = Head(1, 1, CONFIG.network.head_units).apply({"params": own}, read)[..., 0]
-    assert_allclose(agent.reward(params, FEATURES), expected, rtol=1e-5, atol=1e-6)
+    expected = apply(Head(1, 1, CONFIG.network.head_units), own, read)[..., 0]
+    assert_allclose(reward_of(agent, params, FEATURES), expected, rtol=1e-5, atol=1e-6)
     # Agents with two, three and four sources are one, so they train as one population.
     assert agent == make_agent(meta_spec(folder, "hopper", "ant"))
 
@@ -219,6 +231,7 @@ def test_a_meta_model_of_the_dynamics_reads_the_next_states_that_stored_ones_pre
     action = random.uniform(-1, 1, (3, 1)).astype(np.float32)
     noise = np.zeros((3, sizes.stochastic_size), np.float32)
 
+    @functools.partial(jax.jit, static_argnums=0)
     def step(module, params, action):
         return module.apply({"params": params}, latent, action, noise, method="img_step")
 
@@ -276,14 +289,13 @@ def with_classifier(params, **changes):
 def test_a_switching_agent_uses_the_stored_model_of_a_known_task_and_else_the_meta_model(switching):
     agent, sources, params = switching
     features = states_at(3, -3, 0, 3, 40)
-    found = agent.reward(params, features)
+    found = reward_of(agent, params, features)
     plain = usual(agent, "reward")
     first, second = (
-        plain.apply({"params": source.params["reward"]}, features)[..., 0]
-        for source in sources.stored
+        apply(plain, source.params["reward"], features)[..., 0] for source in sources.stored
     )
     # To this one every task is novel.
-    meta = agent.reward(with_classifier(params, threshold=np.float32(-1)), features)
+    meta = reward_of(agent, with_classifier(params, threshold=np.float32(-1)), features)
     expected = [first[0], second[1], meta[2], first[3], meta[4]]
     assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     assert len({round(float(x), 5) for x in (first[0], second[0], meta[0])}) == 3
@@ -313,6 +325,32 @@ def test_a_switching_agent_recognises_the_states_that_it_infers_as_it_runs(switc
     labels = recognise(params["reward"]["classifier"], posterior.features)
     assert labels.shape == posterior.features.shape[:-1]
     assert_array_equal(labels.reshape(-1), [1] * 3 + [NOVEL] * (len(flat) - 3))
+
+
+# --- the latent states that are classified ---------------------------------------------------
+
+
+def test_latent_states_are_samples_along_episodes_or_their_means_or_of_single_images(folder):
+    source = load_sources(spec_of("ant", source=folder / "uae", method="uae")).agent
+    agent, size = make_agent(source.spec), CONFIG.network.stochastic_size
+    batch = batch_for(agent)
+    records = Records(*(x[0] for x in batch))._replace(first=np.arange(5) == 0)
+    found = {
+        (kind, seed): np.asarray(
+            infer(agent, source.params, records, jax.random.key(seed), features=kind)
+        )
+        for kind in ("sample", "mean", "first")
+        for seed in (0, 1)
+    }
+    alone = jax.tree.map(lambda x: x[None], Batch(*records))
+    posterior, _, _ = jax.jit(agent.observe)(source.params, alone, jax.random.key(0))
+    assert_allclose(found["sample", 0], posterior.features[0], rtol=1e-5, atol=1e-6)
+    assert_allclose(found["mean", 0][:, :size], posterior.mean[0], rtol=1e-5, atol=1e-6)
+    assert (found["sample", 0][0, :size] != found["sample", 1][0, :size]).all()
+    assert_array_equal(found["mean", 0][0], found["mean", 1][0])
+    # Without a past, the recurrent state is one and the same for all images.
+    assert_array_equal(found["first", 0][:, size:], found["first", 0][:1, size:].repeat(5, 0))
+    assert (found["sample", 0][1:, size:] != found["sample", 0][:1, size:]).any(1).all()
 
 
 # --- what is refused --------------------------------------------------------------------------
