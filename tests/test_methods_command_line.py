@@ -28,13 +28,19 @@ def train(out, task, *arguments, code=0):
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """A source, two agents on its encoder, the first trained, and a target of meta-models."""
-    runs = tmp_path_factory.mktemp("runs")
-    write_run(runs / "source", spec_of("hopper", "ant"))
-    on = ("--source", runs / "source")
+def source(tmp_path_factory):
+    """An agent for two tasks whose encoder is not trained, which is all one to what uses it."""
+    directory = tmp_path_factory.mktemp("runs") / "source"
+    write_run(directory, spec_of("hopper", "ant"))
+    return directory
+
+
+@pytest.fixture(scope="module")
+def runs(source):
+    """The folder of two agents on the source's encoder, the first trained, and of a target."""
+    runs, on = source.parent, ("--source", source)
     train(runs / TASKS[0], TASKS[0], "--method", "uae", *on)
-    write_run(runs / TASKS[1], spec_of(TASKS[1], method="uae", source=runs / "source"), seed=1)
+    write_run(runs / TASKS[1], spec_of(TASKS[1], method="uae", source=source), seed=1)
     train(
         runs / "target", TASKS[0], "--method", "meta", *on,
         "--reward-sources", *(runs / task for task in TASKS), "--reward-counts", 1, 2,
@@ -89,7 +95,7 @@ def test_a_meta_run_is_evaluated_with_its_stored_models(runs, capsys):
     assert "sources=2, seed 0" in capsys.readouterr().out
 
 
-def test_a_switching_target_knows_the_tasks_of_its_sources(runs, tmp_path):
+def test_a_switching_target_knows_the_tasks_of_its_sources(tmp_path):
     write_run(tmp_path / "source", spec_of(*TASKS))
     on = {"dynamics": "frozen", "source": tmp_path / "source"}
     for seed, task in enumerate(TASKS, start=1):
@@ -105,8 +111,8 @@ def test_a_switching_target_knows_the_tasks_of_its_sources(runs, tmp_path):
     assert_array_equal(given["latents"], classifier["latents"])
 
 
-def test_tasks_are_classified_and_drawn(runs, tmp_path, capsys):
-    words = ["classify", "--source", str(runs / "source"), "--out", str(tmp_path), "--task"]
+def test_tasks_are_classified_and_drawn(source, tmp_path, capsys):
+    words = ["classify", "--source", str(source), "--out", str(tmp_path), "--task"]
     words += ["bullet/hopper", "bullet/ant", "bullet/inverted_pendulum"]
     words += ["--known", "bullet/hopper", "bullet/ant"]
     assert main(words) == 0
@@ -126,7 +132,8 @@ def test_tasks_are_classified_and_drawn(runs, tmp_path, capsys):
         if not row["known"]:
             assert row["correct"] == pytest.approx(1 - row["not_novel"])
         else:
-            assert row["right_task"] == found["votes"][row["task"]].get(row["task"], 0) / 100
+            right = found["votes"][row["task"]].get(row["task"], 0)
+            assert row["right_task"] == pytest.approx(right / 100)
     for name in ("latents.png", "latents.svg"):
         assert (tmp_path / name).stat().st_size > 10_000
         assert str(tmp_path / name) in output
