@@ -20,6 +20,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
+from flax import linen as nn
 
 from dreamer_jax import losses, networks, rssm
 from dreamer_jax.config import COMPONENTS, Config
@@ -89,6 +90,11 @@ def member_key(seed: jax.Array | int, purpose: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), purpose)
 
 
+def _joined(params: Params, trainable: Params) -> Params:
+    """Parameters with the parts of components in `trainable` in place of their own."""
+    return params | {name: params[name] | parts for name, parts in trainable.items()}
+
+
 @dataclass(frozen=True)
 class Agent:
     """The pure functions of an agent of given sizes. Holds no parameters.
@@ -97,11 +103,14 @@ class Agent:
       config: sizes, losses and exploration (the schedule is not used here).
       action_size: A.
       discrete: whether actions are one-hot vectors; else they lie in [-1, 1].
+      modules: what takes the place of the usual module of "dynamics" or of a head, as pairs of
+        name and module: one with the same methods, and with any parameters of its own.
     """
 
     config: Config
     action_size: int
     discrete: bool = False
+    modules: tuple[tuple[str, nn.Module], ...] = ()
 
     @functools.cached_property
     def dtype(self):
@@ -121,7 +130,7 @@ class Agent:
     def dynamics(self) -> rssm.Dynamics:
         network = self.config.network
         layers = networks.encoder_layers(network.image_size)
-        return rssm.Dynamics(
+        usual = rssm.Dynamics(
             stochastic_size=network.stochastic_size,
             deterministic_size=network.deterministic_size,
             hidden_size=network.hidden_size,
@@ -131,6 +140,7 @@ class Agent:
             minimum_std=network.minimum_std,
             dtype=self.dtype,
         )
+        return dict(self.modules).get("dynamics", usual)
 
     @functools.cached_property
     def heads(self) -> dict[str, networks.Head]:
@@ -144,10 +154,11 @@ class Agent:
         }
         if network.termination:
             sizes["termination"] = (1, network.termination_layers)
-        return {
+        usual = {
             name: networks.Head(outputs, layers, network.head_units, self.dtype)
             for name, (outputs, layers) in sizes.items()
         }
+        return usual | {name: module for name, module in self.modules if name in usual}
 
     @functools.cached_property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -158,6 +169,18 @@ class Agent:
         return {
             "model": tuple(name for name in trainable if name not in behaviour),
             **{name: (name,) if name in trainable else () for name in behaviour},
+        }
+
+    def trainable(self, params: Params) -> dict[str, Params]:
+        """What each of the three optimisers trains: the parts of its components not frozen."""
+        frozen = self.config.learning.frozen
+
+        def parts(name):
+            return {part: x for part, x in params[name].items() if f"{name}/{part}" not in frozen}
+
+        return {
+            group: {name: parts(name) for name in names if parts(name)}
+            for group, names in self.groups.items()
         }
 
     @functools.cached_property
@@ -200,10 +223,21 @@ class Agent:
         return self.start(self.init_params(member_key(seed, _INIT)), seed)
 
     def start(self, params: Params, seed: jax.Array | int) -> AgentState:
-        """An agent that starts from given parameters, with fresh optimisers."""
+        """An agent that starts from given parameters, with fresh optimisers.
+
+        Raises:
+          ValueError: a part that is to be frozen is none of the agent's.
+        """
+        for name in self.config.learning.frozen:
+            component, _, part = name.partition("/")
+            if part and part not in params.get(component, {}):
+                raise ValueError(
+                    f"cannot freeze {name!r}: the parts of {component} are "
+                    f"{', '.join(params.get(component, {})) or 'none, it is not in this agent'}"
+                )
         optimisers = {
-            name: self._optimisers[name].init({part: params[part] for part in parts})
-            for name, parts in self.groups.items()
+            name: self._optimisers[name].init(parts)
+            for name, parts in self.trainable(params).items()
         }
         return AgentState(
             params=params,
@@ -343,9 +377,7 @@ class Agent:
         model_key, behaviour_key = jax.random.split(key)
 
         params = state.params
-        parts = {
-            name: {part: params[part] for part in group} for name, group in self.groups.items()
-        }
+        parts = self.trainable(params)
         (_, (posterior, metrics)), model_gradient = jax.value_and_grad(
             self.model_loss, has_aux=True
         )(parts["model"], params, batch, model_key)
@@ -368,7 +400,7 @@ class Agent:
             updates, optimisers[name] = self._optimisers[name].update(
                 gradient, state.optimisers[name]
             )
-            new_params |= optax.apply_updates(parts[name], updates)
+            new_params = _joined(new_params, optax.apply_updates(parts[name], updates))
         finite = jnp.isfinite(jnp.stack(list(metrics.values()))).all()
         healthy = state.healthy & finite
         new_params, optimisers = jax.tree.map(
@@ -383,8 +415,8 @@ class Agent:
         """Loss of the world model: image and reward likelihoods and the floored KL divergence.
 
         Args:
-          trainable: the components that the gradient is taken for.
-          params: all components; those in `trainable` are not used.
+          trainable: the components, or parts of them, that the gradient is taken for.
+          params: all components; what is in `trainable` is not used.
           batch: of one member.
           key: for the posterior's samples.
 
@@ -392,7 +424,7 @@ class Agent:
           The loss, and (posterior states [B, L, ...], metrics).
         """
         learning = self.config.learning
-        params = params | trainable
+        params = _joined(params, trainable)
         batch = batch._replace(image=arrange(batch.image))
         posterior, prior_mean, prior_std = self.observe(params, batch, key)
         features = posterior.features
@@ -432,7 +464,7 @@ class Agent:
         """
         learning = self.config.learning
         starts_key, action_key, state_key = jax.random.split(key, 3)
-        params = jax.lax.stop_gradient(params) | trainable
+        params = _joined(jax.lax.stop_gradient(params), trainable)
         start = jax.tree.map(lambda x: jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]), posterior)
         if learning.imagination_starts is not None:
             count = start.mean.shape[0]

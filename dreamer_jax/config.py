@@ -94,10 +94,10 @@ class LearningConfig:
     adam_epsilon: float = 1e-7
     """Adam's epsilon."""
     frozen: tuple[str, ...] = ()
-    """Components that take no update (for example the encoder of a universal autoencoder)."""
+    """Components, or parts of them, that take no update (such as encoder, or dynamics/gru)."""
 
     def __post_init__(self):
-        unknown = set(self.frozen) - set(COMPONENTS)
+        unknown = {name for name in self.frozen if name.partition("/")[0] not in COMPONENTS}
         _require(
             not unknown,
             f"cannot freeze {sorted(unknown)}: the components are {', '.join(COMPONENTS)}",

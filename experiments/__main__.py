@@ -1,4 +1,4 @@
-"""The command line: python -m experiments {train, evaluate, report, demo}."""
+"""The command line: python -m experiments {train, evaluate, classify, report, demo}."""
 
 import contextlib
 import os
@@ -26,7 +26,7 @@ class Train:
     """Train a population of agents, from scratch or from a source, or resume one.
 
     Several tasks make one multi-task agent. With --source and --omega the population holds one
-    target per fraction and seed.
+    target per fraction and seed; with --method uae or meta, one on the source's frozen encoder.
     """
 
     task: tuple[str, ...]
@@ -46,6 +46,30 @@ class Train:
     """Fractions of the source's last reward and value layers to add (0 to 1)."""
     baseline: bool = False
     """Add agents from scratch, one per seed, to the transfer targets."""
+    method: Literal["fractional", "uae", "meta"] = "fractional"
+    """How the source is used: fractional transfer; as a universal autoencoder with a frozen
+    encoder; or as that and with meta-models over the models of further agents."""
+    fractions: tuple[str, ...] = ("reward", "value", "termination")
+    """fractional: the components whose last layer a fraction is transferred of (any of reward,
+    value, termination, dynamics, actor); the last layers of the other heads are drawn anew."""
+    dynamics: Literal["fresh", "copied", "frozen"] = "fresh"
+    """uae and meta: the latent dynamics, drawn anew, or copied from the source to train on, or
+    copied and frozen but for the kernel of the action."""
+    reward_sources: tuple[Path, ...] = ()
+    """meta: results folders of agents made by --method uae from the same source, whose models the
+    meta-model reads."""
+    reward_counts: tuple[int, ...] = ()
+    """meta: how many of these a target reads, the first ones; one target per number and seed."""
+    meta: tuple[str, ...] = ("reward",)
+    """meta: the components that are meta-models (any of reward, value, dynamics)."""
+    meta_layers: int = 1
+    """meta: hidden layers of a meta-model of reward or value."""
+    switching: bool = False
+    """meta: recognise the task of each latent state, and use the stored reward model of a task
+    that is known and the meta-model for a novel one (needs --dynamics frozen)."""
+    threshold: float | None = None
+    """meta, switching: the distance beyond which a task is novel; by default suggested by the
+    samples of the known tasks."""
     resume: bool = False
     """Continue the run that the results folder holds."""
     workers: int | None = None
@@ -63,6 +87,47 @@ class Evaluate:
     """Episodes per agent and task."""
     video: bool = False
     """Write videos of an episode and of an open-loop prediction into the folder."""
+    workers: int | None = None
+    """Simulator processes; by default one per core."""
+
+
+@dataclass(frozen=True)
+class Classify:
+    """Tell the tasks of latent states, known ones from novel ones, as in Tables 13 to 15.
+
+    Plays episodes of each task, fits a classifier on an agent's latent states of the known tasks,
+    tests it on others, and draws them.
+    """
+
+    source: Path
+    """Results folder of the agent whose latent states are classified."""
+    task: tuple[str, ...]
+    """Names of all tasks."""
+    known: tuple[str, ...]
+    """Those of the tasks that the classifier is fitted on; the others are novel."""
+    out: Path | None = None
+    """Folder for the table and the picture; by default classification/ in the source's."""
+    source_member: int = 0
+    """Which member of the source's population."""
+    samples: int = 100
+    """Latent states of each task to fit on, and as many, of other episodes, to test."""
+    thresholds: tuple[float, ...] = ()
+    """Distances beyond which a state is novel; by default 50, 70 and 90 for 230 features, scaled
+    to the agent's. One suggested by the fitted samples is always added."""
+    quantile: float = 0.95
+    """Share of known samples that the suggested threshold should hold."""
+    neighbours: int = 5
+    """Nearest samples that vote for the task."""
+    policy: Literal["random", "trained"] = "random"
+    """Who plays: random actions, or a trained agent (the mode, without noise)."""
+    actors: tuple[Path, ...] = ()
+    """With --policy trained: results folders of the agents that play, one for each task; by
+    default the source's agent plays all."""
+    features: Literal["sample", "mean", "first"] = "sample"
+    """The latent state: a sample of the posterior along an episode (what agents act on), its mean,
+    or each image as if it were the first of an episode."""
+    seed: int = 0
+    """Of episodes, actions and samples."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
 
@@ -90,6 +155,7 @@ class Demo:
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Classify, tyro.conf.subcommand("classify")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -120,8 +186,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = _parse(arguments)
         _keep_compiled_functions()
         keep_freed_memory()
-        run = {Train: _train, Evaluate: _evaluate, Report: _report, Demo: _demo}[type(command)]
-        return run(command)
+        run = {
+            Train: _train,
+            Evaluate: _evaluate,
+            Classify: _classify,
+            Report: _report,
+            Demo: _demo,
+        }
+        return run[type(command)](command)
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return USAGE
@@ -164,7 +236,8 @@ def _parse(arguments: list[str]):
 
 
 def _train(command: Train) -> int:
-    from experiments.run import RunSpec, carry_out, make_run
+    from experiments.run import carry_out, make_run
+    from experiments.spec import RunSpec
 
     with usage_errors():
         spec = RunSpec(
@@ -175,6 +248,15 @@ def _train(command: Train) -> int:
             source_member=command.source_member,
             omegas=command.omega,
             baseline=command.baseline,
+            method=command.method,
+            fractions=command.fractions,
+            dynamics=command.dynamics,
+            reward_sources=tuple(map(str, command.reward_sources)),
+            reward_counts=command.reward_counts,
+            meta=command.meta,
+            meta_layers=command.meta_layers,
+            switching=command.switching,
+            threshold=command.threshold,
         )
         run = make_run(spec, command.out, resume=command.resume, workers=command.workers)
     if spec.source is not None:
@@ -243,6 +325,51 @@ def _evaluate(command: Evaluate) -> int:
         videos = command.directory / "videos"
         for path in sorted([*videos.glob("evaluate_*.mp4"), *videos.glob("prediction_*.mp4")]):
             print(f"video: {path}")
+    return 0
+
+
+def _classify(command: Classify) -> int:
+    from rich.progress import Progress
+
+    from dreamer_jax.files import write_json_atomically
+    from experiments import classify
+    from experiments.agents import load_source
+
+    request = {
+        "samples": command.samples,
+        "neighbours": command.neighbours,
+        "quantile": command.quantile,
+        "policy": command.policy,
+    }
+    with usage_errors():
+        classify.check_request(command.task, command.known, actors=command.actors, **request)
+        source = load_source(command.source, command.source_member)
+        actors = [load_source(directory) for directory in command.actors]
+        with Progress() as bar:
+            total = classify.rounds(source, command.samples) * max(1, len(actors))
+            job = bar.add_task("gathering samples", total=total)
+            outcome = classify.classify(
+                source,
+                command.task,
+                command.known,
+                thresholds=command.thresholds,
+                features=command.features,
+                actors=actors,
+                seed=command.seed,
+                workers=command.workers,
+                report=lambda: bar.advance(job),
+                **request,
+            )
+    folder = command.source / "classification" if command.out is None else command.out
+    folder.mkdir(parents=True, exist_ok=True)
+    print("Novel tasks: share taken for novel. Known: taken for not novel / for the right task.\n")
+    print(classify.table(outcome) + "\n\n" + classify.distance_table(outcome) + "\n")
+    settings = {"source": str(command.source), "features": command.features, **request}
+    write_json_atomically(
+        folder / "classification.json", {"settings": settings, **classify.to_dict(outcome)}
+    )
+    for path in (folder / "classification.json", *classify.plot(outcome, folder / "latents")):
+        print(f"wrote {path}")
     return 0
 
 

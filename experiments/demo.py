@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dreamer_jax.config import Config
 from dreamer_jax.schedule import Schedule
-from experiments.run import RunSpec
+from experiments.spec import RunSpec
 
 SOURCE_TASKS = ("bullet/inverted_double_pendulum", "bullet/halfcheetah")
 TARGET_TASK = "bullet/inverted_pendulum"

@@ -17,7 +17,7 @@ import numpy as np
 import envs
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.run import BASELINE, RunSpec, read_spec
+from experiments.spec import BASELINE, RunSpec, read_spec
 
 FINAL_SHARE = 0.1
 

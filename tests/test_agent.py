@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax import linen as nn
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dreamer_jax import rssm
+from dreamer_jax import networks, rssm
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import preset
 from dreamer_jax.population import map_members
@@ -184,14 +185,62 @@ def test_frozen_components_do_not_move_and_cost_no_optimiser_memory(update, stat
     assert "value_gradient_norm" not in metrics
 
 
-def test_the_gradient_of_a_frozen_encoder_is_not_computed(agent, state):
-    frozen = Agent(with_settings("learning", frozen=("encoder",)), A)
+PARTS = ("encoder", "dynamics/stoch_in", "dynamics/gru", "dynamics/prior", "actor/hidden_0")
+
+
+def test_frozen_parts_of_components_stay_and_the_rest_of_them_trains(state):
+    frozen = Agent(with_settings("learning", frozen=PARTS), A)
+    start = frozen.start(state.params, 0)
+    new, metrics = jax.jit(frozen.update)(start, batch_of())
+    for component, parts in state.params.items():
+        for part, before in parts.items():
+            after = new.params[component][part]
+            if component in PARTS or f"{component}/{part}" in PARTS:
+                chex.assert_trees_all_equal(after, before)
+            else:
+                assert optax.tree.norm(optax.tree.sub(after, before)) > 0, f"{component}/{part}"
+    trained = {part for part in start.optimisers["model"][1][0].mu["dynamics"]}
+    assert trained == {"action_in", "posterior"}
+    assert metrics["actor_gradient_norm"] > 0
+
+
+def test_a_part_to_freeze_that_is_not_there_is_refused_with_those_there_are(state):
+    agent = Agent(with_settings("learning", frozen=("dynamics/gruu",)), A)
+    with pytest.raises(ValueError, match="'dynamics/gruu': the parts of dynamics are .*gru"):
+        agent.start(state.params, 0)
+
+
+@pytest.mark.parametrize("frozen", ["encoder", "dynamics/gru"])
+def test_the_gradient_of_what_is_frozen_is_not_computed(agent, state, frozen):
+    frozen = Agent(with_settings("learning", frozen=(frozen,)), A)
     start = jax.eval_shape(frozen.init, 0)
 
     def cost(some, start):
         return jax.jit(some.update).lower(start, batch_of()).cost_analysis()["flops"]
 
     assert cost(frozen, start) < cost(agent, state)
+
+
+class Shifted(networks.Head):
+    """A head with one more part, which is added to its outputs."""
+
+    @nn.compact
+    def __call__(self, features):
+        shift = self.param("shift", lambda key: {"by": jnp.ones(())})
+        return super().__call__(features) + shift["by"]
+
+
+def test_a_module_takes_the_place_of_a_components_usual_one(agent, state):
+    head = agent.heads["reward"]
+    module = Shifted(head.outputs, head.layers, head.units, head.dtype)
+    shifted = dataclasses.replace(agent, modules=(("reward", module),))
+    params = jax.jit(shifted.init_params)(jax.random.key(0))
+    features = random.normal(size=(3, CONFIG.network.feature_size)).astype(np.float32)
+    usual = params | {"reward": {k: v for k, v in params["reward"].items() if k != "shift"}}
+    assert_allclose(shifted.reward(params, features), agent.reward(usual, features) + 1, rtol=1e-6)
+    assert shifted.heads["value"] == agent.heads["value"]
+    # Equal agents share their compiled functions.
+    assert hash(shifted) == hash(dataclasses.replace(agent, modules=(("reward", module),)))
 
 
 def test_a_member_whose_loss_is_not_finite_is_frozen_and_the_others_go_on(agent):

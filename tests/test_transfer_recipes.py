@@ -15,6 +15,7 @@ from transfer_trees import bits
 import transfer
 from dreamer_jax import config
 from dreamer_jax.agent import Agent
+from experiments.meta_modules import meta_dynamics, meta_head
 from transfer import recipes
 
 AGENTS = {
@@ -26,13 +27,20 @@ AGENTS = {
 }
 
 
-def agent_tree(preset="debug", action_size=3, discrete=False, **network):
-    """The shapes of a real agent's parameters."""
+def agent_tree(preset="debug", action_size=3, discrete=False, meta=(), samples=0, **network):
+    """The shapes of a real agent's parameters, with meta-models of the components in `meta`."""
     chosen = config.preset(preset)
     chosen = dataclasses.replace(
         chosen, network=dataclasses.replace(chosen.network, **{"image_size": 64} | network)
     )
     agent = Agent(chosen, action_size, discrete)
+    modules = {
+        name: meta_dynamics(agent.dynamics, places=4)
+        if name == "dynamics"
+        else meta_head(agent.heads[name], layers=1, places=4, samples=samples)
+        for name in meta
+    }
+    agent = dataclasses.replace(agent, modules=tuple(modules.items()))
     return jax.eval_shape(agent.init_params, jax.random.key(0))
 
 
@@ -90,6 +98,50 @@ def test_the_universal_autoencoder_freezes_the_encoder_and_the_dynamics_where_as
     frozen = transfer.flatten(jax.tree.map(np.asarray, transfer.frozen(plan, tree)))
     counts = Counter(path.split("/")[0] for path, flag in frozen.items() if flag)
     assert counts == {"encoder": 2 * layers} | ({"dynamics": 13} if dynamics == "frozen" else {})
+
+
+@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("dynamics", ["fresh", "copied", "frozen"])
+def test_a_meta_model_of_the_reward_holds_stored_models_and_all_else_is_as_before(name, dynamics):
+    tree = agent_tree(meta=("reward",), **AGENTS[name])
+    plan = recipes.meta_model(dynamics)
+    found = operations(plan, tree)
+    # Of each stored model two hidden layers and an output, and who is present; of its own one
+    # hidden layer and an output.
+    assert found["reward", "copy"] == 3 * 2 + 1
+    assert found["reward", "keep"] == 2 * 2
+    usual = operations(recipes.universal_autoencoder(dynamics), agent_tree(**AGENTS[name]))
+    for component in set(tree) - {"reward"}:
+        for operation in ("copy", "keep"):
+            assert found[component, operation] == usual[component, operation]
+    assert sum(found.values()) == len(transfer.paths(tree))
+    frozen = Counter(
+        path.split("/")[0] for path, rule in transfer.claims(plan, tree).items() if rule.frozen
+    )
+    layers = 3 if name == "32 pixels" else 4
+    expected = {"encoder": 2 * layers, "reward": 7}
+    assert frozen == expected | ({"dynamics": 13} if dynamics == "frozen" else {})
+
+
+@pytest.mark.parametrize("dynamics", ["fresh", "frozen"])
+def test_meta_models_of_all_components_and_a_classifier(dynamics):
+    components = ("reward", "value", "dynamics")
+    tree = agent_tree(meta=components, samples=8)
+    # The value has a classifier too in this tree; the recipe knows one of the reward alone.
+    del tree["value"]["classifier"]
+    plan = recipes.meta_model(dynamics, components=components, switching=True)
+    found = operations(plan, tree)
+    assert found["reward", "copy"] == 3 * 2 + 1 + 3
+    assert (found["value", "copy"], found["value", "keep"]) == (4 * 2 + 1, 2 * 2)
+    # A stored dynamics model has 14 leaves. The kernels on actions and predictions are fresh.
+    own = 0 if dynamics == "fresh" else 13
+    assert found["dynamics", "copy"] == 14 + 1 + own
+    assert found["dynamics", "keep"] == 15 - own
+    for path, rule in transfer.claims(plan, tree).items():
+        held = "/stored/" in path or "/classifier/" in path
+        assert (rule.source == "stored") == held
+        if held:
+            assert rule.frozen
 
 
 def test_every_rule_claims_leaves_of_an_agent_with_all_heads():
@@ -188,11 +240,23 @@ def test_unknown_options_name_the_choices():
         recipes.fractional_transfer(fractions=["rewards"])
     with pytest.raises(ValueError, match="'fresh', 'copied' or 'frozen'; got 'new'"):
         recipes.universal_autoencoder("new")
+    with pytest.raises(ValueError, match="'fresh', 'copied' or 'frozen'; got 'new'"):
+        recipes.meta_model("new")
+    with pytest.raises(ValueError, match=r"no meta-model for \['actor'\]; choose reward, value"):
+        recipes.meta_model(components=("actor", "reward"))
+    with pytest.raises(ValueError, match="needs a component"):
+        recipes.meta_model(components=())
+    with pytest.raises(ValueError, match="add 'reward'"):
+        recipes.meta_model(components=("value",), switching=True)
 
 
 @pytest.mark.parametrize("suffix", ["json", "yaml"])
 def test_recipes_are_data(tmp_path, suffix):
-    for plan in (recipes.fractional_transfer(0.2), recipes.universal_autoencoder("frozen")):
+    for plan in (
+        recipes.fractional_transfer(0.2),
+        recipes.universal_autoencoder("frozen"),
+        recipes.meta_model(components=("reward", "dynamics"), switching=True),
+    ):
         transfer.write_plan(plan, tmp_path / f"plan.{suffix}")
         assert transfer.read_plan(tmp_path / f"plan.{suffix}") == plan
 

@@ -5,6 +5,7 @@ The paths are those of a Dreamer agent whose parameters are one dictionary:
     encoder/...  decoder/...  dynamics/{stoch_in, action_in, gru, prior, posterior}/...
     reward/{hidden_i, out}  value/{hidden_i, out}  actor/{hidden_i, out}
     termination/{hidden_i, out}                                        (where there is one)
+    {reward, value, dynamics}/stored/{params/..., present}             (where it is a meta-model)
 
 This module knows these names and nothing else of the agent. The target of every recipe is a
 freshly initialised tree, so that ``keep`` is random initialisation. Optimiser state is fresh.
@@ -14,6 +15,8 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from transfer.plan import Plan, Rule
+
+Dynamics = Literal["fresh", "copied", "frozen"]
 
 # The last layer of each component that may be fractionally transferred.
 _LAST_LAYERS = {
@@ -96,7 +99,7 @@ def fractional_transfer(
     )
 
 
-def universal_autoencoder(dynamics: Literal["fresh", "copied", "frozen"] = "fresh") -> Plan:
+def universal_autoencoder(dynamics: Dynamics = "fresh") -> Plan:
     """A target on the autoencoder of an agent trained on several tasks (thesis §3.3.1, Figure 9).
 
     Encoder and decoder are copied; the encoder is frozen (see :func:`transfer.frozen`), so that all
@@ -113,31 +116,107 @@ def universal_autoencoder(dynamics: Literal["fresh", "copied", "frozen"] = "fres
     Raises:
         ValueError: another value of ``dynamics``.
     """
+    heads = (
+        Rule("reward/**", "keep", note="random"),
+        Rule("value/**", "keep", note="random"),
+    )
+    return Plan(
+        name=f"universal autoencoder, {dynamics} dynamics",
+        rules=_on_autoencoder(dynamics, heads),
+    )
+
+
+def meta_model(
+    dynamics: Dynamics = "fresh",
+    *,
+    components: Sequence[str] = ("reward",),
+    switching: bool = False,
+) -> Plan:
+    """A target whose models read what stored models predict (thesis §3.3.2, equation 20, Figure 9).
+
+    As :func:`universal_autoencoder`, and each of the components is a meta-model: it has the frozen
+    models of N source tasks among its own parameters, under ``stored``, and all others fresh. Two
+    sources are given by name: ``apply(plan, target, {"autoencoder": ..., "stored": ...})``, the
+    second with the leaves ``reward/stored/params/...`` [N, ...] and ``reward/stored/present`` [N]
+    (see :func:`transfer.meta_model.store`).
+
+    Args:
+        dynamics: as for :func:`universal_autoencoder`.
+        components: which models are meta-models: ``"reward"``, and beyond the thesis ``"value"``
+            and ``"dynamics"``, whose kernel on the predictions is ``dynamics/stored_in``.
+        switching: whether the reward model also holds a classifier of tasks, under
+            ``reward/classifier``, by which it leaves known tasks to their stored models.
+
+    Raises:
+        ValueError: another value of ``dynamics``, an unknown component, or switching without a
+            meta-model of the reward.
+    """
+    if unknown := sorted(set(components) - {"reward", "value", "dynamics"}):
+        raise ValueError(f"There is no meta-model for {unknown}; choose reward, value, dynamics.")
+    if not components:
+        raise ValueError("A meta-model needs a component: choose from reward, value, dynamics.")
+    if switching and "reward" not in components:
+        raise ValueError("Switching is between reward models: add 'reward' to the components.")
+
+    def stored(component: str) -> Rule:
+        return Rule(
+            f"{component}/stored/**", "copy", source="stored", frozen=True, note="equation 20"
+        )
+
+    def head(component: str) -> tuple[Rule, ...]:
+        if component not in components:
+            return (Rule(f"{component}/**", "keep", note="random"),)
+        held = [f"{component}/stored/**"]
+        rules = [stored(component)]
+        if switching and component == "reward":
+            held.append("reward/classifier/*")
+            rules.append(Rule(held[-1], "copy", source="stored", frozen=True, note="equation 22"))
+        others = (f"{component}/**", *(f"!{pattern}" for pattern in held))
+        return (*rules, Rule(others, "keep", note="random: the meta-model"))
+
+    rules = (*head("reward"), *head("value"))
+    if "dynamics" in components:
+        rules = (stored("dynamics"), *rules)
+    return Plan(
+        name=f"meta-model of {', '.join(components)}, {dynamics} dynamics",
+        rules=_on_autoencoder(
+            dynamics, rules, source="autoencoder", meta_dynamics="dynamics" in components
+        ),
+    )
+
+
+def _on_autoencoder(
+    dynamics: str,
+    heads: Sequence[Rule],
+    *,
+    source: str | None = None,
+    meta_dynamics: bool = False,
+) -> tuple[Rule, ...]:
+    """The rules of an agent on a universal autoencoder, with those given for reward and value."""
     if dynamics not in ("fresh", "copied", "frozen"):
         raise ValueError(f"dynamics is 'fresh', 'copied' or 'frozen'; got {dynamics!r}.")
+    others = ("!dynamics/stored/**",) if meta_dynamics else ()
     if dynamics == "fresh":
-        rules = (Rule("dynamics/**", "keep", note="random"),)
+        rules = [Rule(("dynamics/**", *others), "keep", note="random")]
     else:
-        rules = (
+        inputs = ("dynamics/action_in/*", *(("dynamics/stored_in/*",) if meta_dynamics else ()))
+        rules = [
             Rule(
-                ("dynamics/**", "!dynamics/action_in/*"),
+                ("dynamics/**", *others, *(f"!{pattern}" for pattern in inputs)),
                 "copy",
+                source=source,
                 frozen=dynamics == "frozen",
                 note="the same physics",
             ),
-            Rule("dynamics/action_in/*", "keep", note="random: actions differ"),
-        )
-    return Plan(
-        name=f"universal autoencoder, {dynamics} dynamics",
-        rules=(
-            Rule("encoder/**", "copy", frozen=True, note="the universal features"),
-            Rule("decoder/**", "copy", note="trains on"),
-            *rules,
-            Rule("reward/**", "keep", note="random"),
-            Rule("value/**", "keep", note="random"),
-            Rule("actor/**", "keep", note="random"),
-            Rule("termination/**", "keep", optional=True, note="random"),
-        ),
+            Rule(inputs, "keep", note="random: actions differ"),
+        ]
+    return (
+        Rule("encoder/**", "copy", source=source, frozen=True, note="the universal features"),
+        Rule("decoder/**", "copy", source=source, note="trains on"),
+        *rules,
+        *heads,
+        Rule("actor/**", "keep", note="random"),
+        Rule("termination/**", "keep", optional=True, note="random"),
     )
 
 

@@ -1,0 +1,62 @@
+"""Results folders made in a moment: a run as its spec says, of agents that have not trained."""
+
+import jax
+import numpy as np
+
+import transfer
+from dreamer_jax.agent import Batch
+from dreamer_jax.checkpoint import Checkpointer
+from dreamer_jax.config import preset
+from dreamer_jax.files import write_json_atomically
+from experiments.agents import Source, load_source, make_agent, plan
+from experiments.spec import RunSpec
+
+CONFIG = preset("debug")
+
+
+def spec_of(*tasks, seeds=(0,), config=CONFIG, **settings) -> RunSpec:
+    """A spec for tasks named without their backend."""
+    names = tuple(f"bullet/{task}" for task in tasks)
+    settings = {k: str(v) if k == "source" else v for k, v in settings.items()}
+    if "reward_sources" in settings:
+        settings["reward_sources"] = tuple(map(str, settings["reward_sources"]))
+    return RunSpec(names, seeds, config, **settings)
+
+
+def random_params(agent, seed=0):
+    """Parameters of the shapes of an agent's, without compiling its initialisation."""
+    random = np.random.default_rng(seed)
+    shapes = jax.eval_shape(agent.init_params, jax.random.key(0))
+    return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
+
+
+def write_run(directory, spec: RunSpec, seed=0) -> Source:
+    """A results folder of agents with random parameters, after the run's method.
+
+    Returns:
+      Its first agent.
+    """
+    params = random_params(make_agent(spec), seed)
+    if spec.method == "uae":
+        source = load_source(spec.source)
+        given, claims = transfer.flatten(source.params), transfer.claims(plan(spec), params)
+        copied = [path for path, rule in claims.items() if rule.operation == "copy"]
+        params = transfer.unflatten(params, {path: given[path] for path in copied})
+    params = jax.tree.map(lambda x: np.stack([x] * len(spec.members)), params)
+    Checkpointer(directory / "checkpoints").save(0, {"agent": {"params": params}}, {})
+    write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
+    return load_source(directory)
+
+
+def batch_for(agent, *leading, seed=0) -> Batch:
+    """Random records, leaves [..., B, L, ...]."""
+    random = np.random.default_rng(seed)
+    learning, size = agent.config.learning, agent.config.network.image_size
+    shape = (*leading, learning.batch_size, learning.sequence_length)
+    return Batch(
+        image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
+        action=random.uniform(-1, 1, (*shape, agent.action_size)).astype(np.float32),
+        reward=random.normal(size=shape).astype(np.float32),
+        first=random.random(shape) < 0.1,
+        terminal=np.zeros(shape, bool),
+    )
