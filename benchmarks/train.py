@@ -1,11 +1,12 @@
 """Where the time of a training run goes: one JSON line.
 
-    python -m benchmarks.train [task=bullet/inverted_pendulum] [preset=cpu] [P=1] [phases=3]
+    python -m benchmarks.train [task=bullet/inverted_pendulum] [preset=cpu] [P=1]
 
-Runs prefill and `phases` rounds of a real run in a temporary folder, twice: the first run
-compiles. The shares of the second run's time are those in updates, in simulators (a tick of all of
-them, from its request to its last reply), waiting for batches, in policies and the bridge to the
-simulators, and in the rest (checkpoints, metrics, videos).
+Runs a real run in a temporary folder from its start to its second evaluation. All is compiled by
+the first; the shares are of the time from there on, a whole period of the schedule: phases and
+their updates, a checkpoint, an evaluation. They are those in updates, in simulators (a tick of all
+of them, from its request to its last reply), waiting for batches, in policies and the bridge to
+the simulators, and in the rest (checkpoints, metrics, videos).
 """
 
 import contextlib
@@ -24,7 +25,7 @@ from dreamer_jax.config import preset
 from dreamer_jax.host_memory import keep_freed_memory
 from experiments.run import RunSpec, make_run
 
-DEFAULTS = {"task": "bullet/inverted_pendulum", "preset": "cpu", "P": 1, "phases": 3}
+DEFAULTS = {"task": "bullet/inverted_pendulum", "preset": "cpu", "P": 1}
 
 
 class Stopwatch:
@@ -45,12 +46,13 @@ class Stopwatch:
 
 
 def shares(spec: RunSpec, directory: Path) -> dict:
-    """Seconds of a whole run by what they went to."""
+    """Seconds from a run's first evaluation to its second by what they went to."""
     run = make_run(spec, directory)
     simulators, waiting = Stopwatch(), Stopwatch()
-    pool, replay = run.env._pool, run.replay
+    pool, replay, writer = run.env._pool, run.replay, run.writer
     pool.reset, pool.step = simulators.timed(pool.reset), simulators.timed(pool.step)
-    batches = replay.batches
+    batches, write_timing = replay.batches, writer.write_timing
+    rows, moments = [], []
 
     @contextlib.contextmanager
     def timed_batches(*arguments, **options):
@@ -58,25 +60,31 @@ def shares(spec: RunSpec, directory: Path) -> dict:
             following = waiting.timed(prefetcher.__next__)
             yield (following() for _ in arguments[1])
 
-    replay.batches = timed_batches
-    started = time.perf_counter()
+    def watched_timing(row):
+        write_timing(row)
+        rows.append(row)
+        if row["kind"] == "evaluate":
+            moments.append((time.perf_counter(), simulators.seconds, waiting.seconds, len(rows)))
+
+    replay.batches, writer.write_timing = timed_batches, watched_timing
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             run.train()
-        total = time.perf_counter() - started
     finally:
         run.close()
         run.env.close()
-    rows = [json.loads(row) for row in (directory / "timings.jsonl").read_text().splitlines()]
-    updates = sum(row["seconds"] for row in rows if row["kind"] == "update") - waiting.seconds
+    first, second = moments[:2]
+    total, in_simulators, waited = (b - a for a, b in zip(first[:3], second[:3], strict=True))
+    rows = rows[first[3] : second[3]]
+    updates = sum(row["seconds"] for row in rows if row["kind"] == "update") - waited
     phases = sum(row["seconds"] for row in rows if row["kind"] != "update")
     return {
         "total": total,
         "updates": updates,
-        "simulators": simulators.seconds,
-        "waiting for batches": waiting.seconds,
-        "policies and bridge": phases - simulators.seconds,
-        "rest": total - updates - waiting.seconds - phases,
+        "simulators": in_simulators,
+        "waiting for batches": waited,
+        "policies and bridge": phases - in_simulators,
+        "rest": total - updates - waited - phases,
     }
 
 
@@ -85,11 +93,8 @@ def main():
     # As the command line does.
     keep_freed_memory()
     config = preset(a["preset"])
-    steps = config.schedule.phase_environment_steps
     schedule = dataclasses.replace(
-        config.schedule,
-        environment_steps=(config.schedule.prefill_phases + a["phases"]) * steps,
-        evaluate_every=2 * a["phases"] * steps,
+        config.schedule, environment_steps=2 * config.schedule.evaluate_every
     )
     spec = RunSpec(
         tasks=(a["task"],),
@@ -97,8 +102,7 @@ def main():
         config=dataclasses.replace(config, schedule=schedule),
     )
     with tempfile.TemporaryDirectory() as directory:
-        for name in ("compiling", "measured"):
-            seconds = shares(spec, Path(directory) / name)
+        seconds = shares(spec, Path(directory) / "run")
     total = seconds.pop("total")
     result = {
         "benchmark": "train",

@@ -112,6 +112,12 @@ class Agent:
     discrete: bool = False
     modules: tuple[tuple[str, nn.Module], ...] = ()
 
+    def __post_init__(self):
+        if self.config.learning.entropy_scale and not self.discrete:
+            raise ValueError(
+                "entropy_scale is for discrete actions, and these are continuous: leave it at 0"
+            )
+
     @functools.cached_property
     def dtype(self):
         return jnp.dtype(self.config.network.precision)
@@ -496,6 +502,13 @@ class Agent:
             "imagined_reward": rewards.mean(),
             "imagined_value": values.mean(),
         }
+        if learning.entropy_scale:
+            # The states that the actor acted in: the start, and all but the last two.
+            acted_in = jnp.concatenate([start.features[None], features[:-2]])
+            logits = self.head(params, "actor", jax.lax.stop_gradient(acted_in))
+            entropy = losses.categorical_entropy(logits)
+            actor_loss -= learning.entropy_scale * (weights * entropy).mean()
+            metrics |= {"actor_loss": actor_loss, "actor_entropy": entropy.mean()}
         return actor_loss + value_loss, metrics
 
     def predict(

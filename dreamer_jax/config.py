@@ -89,6 +89,9 @@ class LearningConfig:
     """Adam's step size for the value head."""
     actor_learning_rate: float = 8e-5
     """Adam's step size for the actor."""
+    entropy_scale: float = 0.0
+    """Weight of the policy's entropy in the actor's loss, in rewards per nat (discrete actions
+    only; the thesis has none). It keeps an actor from settling on one action early."""
     gradient_norm: float = 100.0
     """Largest norm of the gradient of each of the three groups; larger ones are scaled down."""
     adam_epsilon: float = 1e-7

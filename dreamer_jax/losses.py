@@ -86,6 +86,12 @@ def actor_loss(returns: jax.Array, weights: jax.Array) -> jax.Array:
     return -(weights * returns).mean()
 
 
+def categorical_entropy(logits: jax.Array) -> jax.Array:
+    """Entropy of categorical distributions, in nats: [..., A] -> [...]."""
+    log_probabilities = jax.nn.log_softmax(logits)
+    return -(jnp.exp(log_probabilities) * log_probabilities).sum(-1)
+
+
 def value_loss(values: jax.Array, returns: jax.Array, weights: jax.Array) -> jax.Array:
     """Mean weighted half squared error to the returns (second line of equation 17)."""
     chex.assert_equal_shape([values, returns, weights])

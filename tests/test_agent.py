@@ -357,6 +357,23 @@ def test_discrete_actions_are_one_hot_and_their_actor_learns():
             assert sorted(action.tolist()) == [0.0, 0.0, 1.0]
 
 
+def test_entropys_weight_pulls_an_actor_towards_even_odds():
+    agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=3e-3), 3, True)
+    state, batch, update = jax.jit(agent.init)(0), batch_of(), jax.jit(agent.update)
+    batch = batch._replace(action=np.eye(3, dtype=np.float32)[np.zeros((B, L), int)])
+    entropies = []
+    for _ in range(30):
+        state, metrics = update(state, batch)
+        entropies.append(float(metrics["actor_entropy"]))
+    assert entropies[0] < entropies[-1] <= np.log(3) + 1e-6
+    assert np.log(3) - entropies[-1] < 0.2 * (np.log(3) - entropies[0])
+
+
+def test_continuous_actions_have_no_weight_of_entropy():
+    with pytest.raises(ValueError, match="entropy_scale is for discrete actions"):
+        Agent(with_settings("learning", entropy_scale=0.1), 3)
+
+
 def test_epsilon_greedy_falls_from_its_start_to_its_end():
     config = with_settings("exploration", exploration_kind="epsilon_greedy", epsilon_decay=100)
     agent = Agent(config, 1)

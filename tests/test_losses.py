@@ -115,3 +115,9 @@ def test_losses_refuse_shapes_that_would_broadcast():
         losses.unit_gaussian_loss(jnp.zeros((4, 1)), jnp.zeros((4,)))
     with pytest.raises(AssertionError):
         losses.value_loss(jnp.zeros((4, 1)), jnp.zeros((4,)), jnp.zeros((4,)))
+
+
+def test_the_entropy_of_even_odds_is_log_2_and_of_a_certain_choice_0():
+    logits = jnp.array([[0.0, 0.0], [50.0, 0.0], [jnp.log(3.0), 0.0]])
+    quarter = -(0.25 * np.log(0.25) + 0.75 * np.log(0.75))
+    assert_allclose(losses.categorical_entropy(logits), [np.log(2), 0, quarter], atol=1e-6)
