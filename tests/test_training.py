@@ -304,7 +304,7 @@ def test_an_environment_of_other_sizes_is_refused_naming_both(tmp_path):
 
 
 def learning_config():
-    """Small networks and 1200 updates, which are enough to solve a probe."""
+    """Small networks and 780 updates, which are enough to solve a probe."""
     return dataclasses.replace(
         CONFIG,
         network=dataclasses.replace(CONFIG.network, head_units=32, hidden_size=32),
@@ -320,11 +320,11 @@ def learning_config():
         ),
         schedule=dataclasses.replace(
             CONFIG.schedule,
-            environment_steps=2000,
+            environment_steps=1300,
             phase_environment_steps=100,
             updates_per_phase=60,
-            evaluate_every=2000,
-            checkpoint_every=2000,
+            evaluate_every=1300,
+            checkpoint_every=1300,
         ),
     )
 
