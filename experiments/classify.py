@@ -300,10 +300,10 @@ def plot(outcome: Outcome, stem: str | Path) -> list[Path]:
     left.set_xlabel(f"first principal component ({shares[0]:.0%} of the variance)")
     left.set_ylabel(f"second ({shares[1]:.0%})")
     left.set_title("latent states: fitted (small) and tested (large)")
-    left.legend(frameon=False)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     for threshold in outcome.thresholds[:-1]:
         right.axvline(threshold, color="black", linewidth=0.8, linestyle=":")
-    right.axvline(outcome.thresholds[-1], color="black", linewidth=0.8, label="suggested ξ")
+    right.axvline(outcome.thresholds[-1], color="black", linewidth=0.8)
     right.set_yticks(
         range(len(outcome.tasks)),
         [_title(task) + ("" if task in outcome.known else " (novel)") for task in outcome.tasks],
@@ -311,8 +311,7 @@ def plot(outcome: Outcome, stem: str | Path) -> list[Path]:
     right.set_xlim(left=0)
     right.invert_yaxis()
     right.set_xlabel("Manhattan distance to the nearest fitted state")
-    right.set_title("tested states; dotted: the other thresholds")
-    right.legend(frameon=False)
+    right.set_title("tested states; lines: thresholds ξ, solid the suggested one")
     paths = [Path(stem).with_suffix(suffix) for suffix in (".png", ".svg")]
     for path in paths:
         figure.savefig(path, dpi=150)

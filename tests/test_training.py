@@ -303,8 +303,8 @@ def test_an_environment_of_other_sizes_is_refused_naming_both(tmp_path):
         run_in(tmp_path, agent=Agent(CONFIG, 2, discrete=True))
 
 
-def learning_config():
-    """Small networks and 780 updates, which are enough to solve a probe."""
+def learning_config(environment_steps):
+    """Small networks, which solve a probe in about 500 updates."""
     return dataclasses.replace(
         CONFIG,
         network=dataclasses.replace(CONFIG.network, head_units=32, hidden_size=32),
@@ -320,18 +320,18 @@ def learning_config():
         ),
         schedule=dataclasses.replace(
             CONFIG.schedule,
-            environment_steps=1300,
+            environment_steps=environment_steps,
             phase_environment_steps=100,
             updates_per_phase=60,
-            evaluate_every=1300,
-            checkpoint_every=1300,
+            evaluate_every=environment_steps,
+            checkpoint_every=environment_steps,
         ),
     )
 
 
 def test_the_probe_is_solved_in_seconds(tmp_path):
     # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
-    config = learning_config()
+    config = learning_config(1300)
     agent, env = Agent(config, 2), Probe(falls=False)
     trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
     score = [row for row in read_metrics(tmp_path) if row["kind"] == "evaluation"][-1]["return"]
@@ -339,7 +339,7 @@ def test_the_probe_is_solved_in_seconds(tmp_path):
 
 
 def test_discrete_choices_are_learned_with_their_values(tmp_path):
-    config = learning_config()
+    config = learning_config(2000)
     agent, env, ticks = Agent(config, 3, discrete=True), Walk(), config.schedule.phase_ticks
     run, _ = trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))
     # From any cell the best choices lose a tick at most.
