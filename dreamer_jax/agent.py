@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 
-from dreamer_jax import losses, networks, rssm
+from dreamer_jax import learning, networks, rssm
 from dreamer_jax.config import COMPONENTS, Config
-from dreamer_jax.convolutions import arrange, image_distance, normalise_image
+from dreamer_jax.convolutions import normalise_image
 
 Params = dict[str, Any]
 Metrics = dict[str, jax.Array]
@@ -88,11 +88,6 @@ _INIT, _UPDATE = 0, 1
 def member_key(seed: jax.Array | int, purpose: int) -> jax.Array:
     """The key of a member for one purpose; members with one seed share it."""
     return jax.random.fold_in(jax.random.key(seed), purpose)
-
-
-def _joined(params: Params, trainable: Params) -> Params:
-    """Parameters with the parts of components in `trainable` in place of their own."""
-    return params | {name: params[name] | parts for name, parts in trainable.items()}
 
 
 @dataclass(frozen=True)
@@ -191,16 +186,16 @@ class Agent:
 
     @functools.cached_property
     def _optimisers(self) -> dict[str, optax.GradientTransformation]:
-        learning = self.config.learning
+        config = self.config.learning
         rates = {
-            "model": learning.model_learning_rate,
-            "value": learning.value_learning_rate,
-            "actor": learning.actor_learning_rate,
+            "model": config.model_learning_rate,
+            "value": config.value_learning_rate,
+            "actor": config.actor_learning_rate,
         }
         return {
             name: optax.chain(
-                optax.clip_by_global_norm(learning.gradient_norm),
-                optax.adam(rate, eps=learning.adam_epsilon),
+                optax.clip_by_global_norm(config.gradient_norm),
+                optax.adam(rate, eps=config.adam_epsilon),
             )
             for name, rate in rates.items()
         }
@@ -326,7 +321,7 @@ class Agent:
         if mode == "evaluate":
             action = self._mode(outputs, action_key)
         else:
-            action = self._sample(outputs, self._action_noise(action_key, ()))
+            action = self.sample(outputs, self.action_noise(action_key, ()))
             action = self._explore(action, explore_key, updates)
         return action, Carry(state, action)
 
@@ -337,11 +332,13 @@ class Agent:
             return jax.nn.one_hot(choice, self.action_size)
         return jax.random.uniform(key, (self.action_size,), minval=-1.0, maxval=1.0)
 
-    def _action_noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    def action_noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        """What `sample` turns into actions, float32 [*shape, A]."""
         draw = jax.random.gumbel if self.discrete else jax.random.normal
         return draw(key, (*shape, self.action_size))
 
-    def _sample(self, outputs: jax.Array, noise: jax.Array) -> jax.Array:
+    def sample(self, outputs: jax.Array, noise: jax.Array) -> jax.Array:
+        """An action, [..., A], from the actor's outputs and `action_noise`."""
         if self.discrete:
             return networks.one_hot_sample(outputs, noise)
         return networks.tanh_normal_sample(outputs, noise)
@@ -385,11 +382,11 @@ class Agent:
         params = state.params
         parts = self.trainable(params)
         (_, (posterior, metrics)), model_gradient = jax.value_and_grad(
-            self.model_loss, has_aux=True
-        )(parts["model"], params, batch, model_key)
+            learning.model_loss, argnums=1, has_aux=True
+        )(self, parts["model"], params, batch, model_key)
         (_, behaviour_metrics), behaviour_gradient = jax.value_and_grad(
-            self.behaviour_loss, has_aux=True
-        )(parts["actor"] | parts["value"], params, posterior, behaviour_key)
+            learning.behaviour_loss, argnums=1, has_aux=True
+        )(self, parts["actor"] | parts["value"], params, posterior, behaviour_key)
         gradients = {"model": model_gradient} | {
             name: {part: behaviour_gradient[part] for part in parts[name]}
             for name in ("actor", "value")
@@ -406,7 +403,7 @@ class Agent:
             updates, optimisers[name] = self._optimisers[name].update(
                 gradient, state.optimisers[name]
             )
-            new_params = _joined(new_params, optax.apply_updates(parts[name], updates))
+            new_params = learning.joined(new_params, optax.apply_updates(parts[name], updates))
         finite = jnp.isfinite(jnp.stack(list(metrics.values()))).all()
         healthy = state.healthy & finite
         new_params, optimisers = jax.tree.map(
@@ -416,100 +413,6 @@ class Agent:
         )
         state = AgentState(new_params, optimisers, state.updates + 1, state.seed, healthy)
         return state, metrics
-
-    def model_loss(self, trainable: Params, params: Params, batch: Batch, key: jax.Array):
-        """Loss of the world model: image and reward likelihoods and the floored KL divergence.
-
-        Args:
-          trainable: the components, or parts of them, that the gradient is taken for.
-          params: all components; what is in `trainable` is not used.
-          batch: of one member.
-          key: for the posterior's samples.
-
-        Returns:
-          The loss, and (posterior states [B, L, ...], metrics).
-        """
-        learning = self.config.learning
-        params = _joined(params, trainable)
-        batch = batch._replace(image=arrange(batch.image))
-        posterior, prior_mean, prior_std = self.observe(params, batch, key)
-        features = posterior.features
-        image_loss = image_distance(self.decode(params, features), batch.image).mean()
-        reward_loss = losses.unit_gaussian_loss(self.reward(params, features), batch.reward)
-        kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
-        loss = image_loss + reward_loss
-        loss += learning.kl_scale * losses.floored_kl(kl, learning.free_nats)
-        metrics = {"image_loss": image_loss, "reward_loss": reward_loss, "kl": kl.mean()}
-        if "termination" in self.heads:
-            logits = self.head(params, "termination", features)[..., 0]
-            target = learning.discount * (1.0 - batch.terminal)
-            termination_loss = losses.bernoulli_loss(logits, target)
-            loss += learning.termination_scale * termination_loss
-            metrics["termination_loss"] = termination_loss
-        metrics["model_loss"] = loss
-        return loss, (posterior, metrics)
-
-    def behaviour_loss(
-        self, trainable: Params, params: Params, posterior: rssm.LatentState, key: jax.Array
-    ):
-        """Loss of the actor plus loss of the value head, both on the same imagined states.
-
-        The actor's gradient comes through the dynamics. The policy reads stopped features: the
-        gradient reaches an action through the states and rewards that follow it, not through the
-        states that the policy saw before. The value head is trained towards returns that are held
-        fixed, on features that are, so neither loss has a gradient for the other's parameters.
-
-        Args:
-          trainable: the components of "actor" and "value" that the gradient is taken for.
-          params: all components.
-          posterior: states to start from, leaves [B, L, ...]; no gradient reaches them.
-          key: for starts, actions and states.
-
-        Returns:
-          The sum of the losses, and metrics.
-        """
-        learning = self.config.learning
-        starts_key, action_key, state_key = jax.random.split(key, 3)
-        params = _joined(jax.lax.stop_gradient(params), trainable)
-        start = jax.tree.map(lambda x: jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]), posterior)
-        if learning.imagination_starts is not None:
-            count = start.mean.shape[0]
-            chosen = jax.random.permutation(starts_key, count)[: learning.imagination_starts]
-            start = jax.tree.map(lambda x: x[chosen], start)
-
-        def policy(features, noise):
-            outputs = self.head(params, "actor", jax.lax.stop_gradient(features))
-            return self._sample(outputs, noise)
-
-        noise = self._action_noise(action_key, (learning.horizon, start.mean.shape[0]))
-        states = rssm.imagine(
-            self.dynamics, params["dynamics"], policy, start, learning.horizon, state_key, noise
-        )
-        features = states.features
-        rewards = self.reward(params, features)
-        values, trained_values = _forked(self.value, params, features)
-        if "termination" in self.heads:
-            discounts = jax.nn.sigmoid(self.head(params, "termination", features)[..., 0])
-        else:
-            discounts = jnp.full_like(rewards, learning.discount)
-        returns = losses.lambda_return(rewards, values, discounts, learning.return_lambda)
-        weights = losses.trajectory_weights(discounts)
-        actor_loss = losses.actor_loss(returns, weights)
-        value_loss = losses.value_loss(trained_values[:-1], returns, weights)
-        metrics = {
-            "actor_loss": actor_loss,
-            "value_loss": value_loss,
-            "imagined_reward": rewards.mean(),
-            "imagined_value": values.mean(),
-        }
-        if learning.entropy_scale:
-            # The states that the actor acted in: the start, and all but the last two.
-            acted_in = jnp.concatenate([start.features[None], features[:-2]])
-            logits = self.head(params, "actor", jax.lax.stop_gradient(acted_in))
-            entropy = losses.categorical_entropy(logits)
-            actor_loss -= learning.entropy_scale * (weights * entropy).mean()
-            metrics |= {"actor_loss": actor_loss, "actor_entropy": entropy.mean()}
-        return actor_loss + value_loss, metrics
 
     def predict(
         self, params: Params, batch: Batch, context: int, key: jax.Array
@@ -545,26 +448,3 @@ class Agent:
         truth = normalise_image(batch.image)
         model = self.decode(params, features)
         return truth + 0.5, jnp.clip(model + 0.5, 0.0, 1.0)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _forked(function, params, features):
-    """function(params, features) twice, computed once.
-
-    The gradient of the first reaches the features only, that of the second the parameters only.
-    """
-    output = function(params, features)
-    return output, output
-
-
-def _forked_forward(function, params, features):
-    output, pull_back = jax.vjp(function, params, features)
-    return (output, output), pull_back
-
-
-def _forked_backward(function, pull_back, gradients):
-    to_features, to_params = gradients
-    return pull_back(to_params)[0], pull_back(to_features)[1]
-
-
-_forked.defvjp(_forked_forward, _forked_backward)

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dreamer_jax import networks, rssm
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import preset
+from dreamer_jax.learning import behaviour_loss, model_loss
 from dreamer_jax.population import map_members
 
 A = 2
@@ -115,12 +116,12 @@ def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, st
     posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(0))
 
     def loss(params):
-        return agent.behaviour_loss({}, params, posterior, jax.random.key(1))[0]
+        return behaviour_loss(agent, {}, params, posterior, jax.random.key(1))[0]
 
     @jax.jit
     @jax.grad
     def gradient_of_actor(actor, params):
-        return agent.behaviour_loss({"actor": actor}, params, posterior, jax.random.key(1))[0]
+        return behaviour_loss(agent, {"actor": actor}, params, posterior, jax.random.key(1))[0]
 
     # Only what is passed as trainable gets a gradient: dynamics, reward and value get none.
     assert optax.tree.norm(jax.jit(jax.grad(loss))(state.params)) == 0.0
@@ -138,7 +139,7 @@ def test_no_gradient_of_actor_or_value_reaches_the_world_model(agent, state):
         params = state.params | {"encoder": encoder}
         posterior, _, _ = agent.observe(params, batch_of(), jax.random.key(0))
         trainable = {name: params[name] for name in ("actor", "value")}
-        return agent.behaviour_loss(trainable, params, posterior, jax.random.key(1))[0]
+        return behaviour_loss(agent, trainable, params, posterior, jax.random.key(1))[0]
 
     gradient = jax.jit(jax.grad(loss))(state.params["encoder"])
     assert optax.tree.norm(gradient) == 0.0
@@ -150,8 +151,8 @@ def test_the_gradients_of_actor_and_value_are_those_of_their_own_losses(agent, s
 
     def gradient_of(name):
         def loss(trainable, posterior):
-            total, metrics = agent.behaviour_loss(
-                trainable, state.params, posterior, jax.random.key(1)
+            total, metrics = behaviour_loss(
+                agent, trainable, state.params, posterior, jax.random.key(1)
             )
             return total if name is None else metrics[name]
 
@@ -273,7 +274,7 @@ def test_imagination_from_fewer_states_costs_less(agent):
     posterior = jax.tree.map(jnp.zeros_like, agent.dynamics.initial((B, L)))
 
     def matrix_products(agent):
-        loss = functools.partial(agent.behaviour_loss, {})
+        loss = functools.partial(behaviour_loss, agent, {})
         lowered = jax.jit(loss).lower(params, posterior, jax.random.key(0))
         return lowered.cost_analysis()["flops"]
 
@@ -292,7 +293,7 @@ def test_the_termination_heads_target_is_the_discount_and_its_scale_ten():
     params = with_termination_logit(agent.init_params(jax.random.key(0)), 1.5)
     batch = batch_of()
     batch.terminal[0, :3] = True  # 3 of 10 records
-    _, (_, metrics) = jax.jit(lambda p: agent.model_loss({}, p, batch, jax.random.key(1)))(params)
+    _, (_, metrics) = jax.jit(lambda p: model_loss(agent, {}, p, batch, jax.random.key(1)))(params)
     # Cross-entropy of sigmoid(1.5) with targets 0 (terminal) and 0.99 (the others).
     p = 1 / (1 + np.exp(-1.5))
     going_on = -0.99 * np.log(p) - 0.01 * np.log(1 - p)
@@ -311,7 +312,7 @@ def test_imagination_weighs_what_follows_by_the_termination_head():
     start = plain.dynamics.initial((B, L))
 
     def actor_loss(some, params):
-        loss = jax.jit(lambda p: some.behaviour_loss({}, p, start, jax.random.key(1)))
+        loss = jax.jit(lambda p: behaviour_loss(some, {}, p, start, jax.random.key(1)))
         return loss(params)[1]["actor_loss"]
 
     # Where every state ends the episode, a return is its reward, and only the first one counts.
