@@ -10,6 +10,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
@@ -29,14 +30,15 @@ ABOUT = (
     "is the mean of all evaluation returns of a run, <em>final</em> that of the last tenth of its "
     "environment steps (section 4.2.3).",
     "± is the standard deviation of all these returns, of all seeds together. The thesis does not "
-    "say its sense; its numbers do. Among three numbers that do not exceed M the deviation is at "
-    "most √2 (M − mean), or √3 with n − 1 in place of n. InvertedPendulum's agents end near 880 ± "
-    "30, so their seeds' means could not deviate by more than about 260 from 723, and yet 723 ± "
-    "364 is printed for the baseline; the same holds for each of the 13 overall deviations of that "
-    "task whose final one is not a copy. Nor can it be the deviation of three seeds at each "
-    "evaluation, averaged. What is left is the deviation over evaluations, which contains the rise "
-    "of the learning curve. Final deviations are read in the same way; for these the numbers do "
-    "not tell it from a deviation of three seeds' means.",
+    "say its sense; its numbers do. Among three numbers of which none exceeds M, the deviation is "
+    "at most √2 (M − mean), or √3 with n − 1 in place of n. InvertedPendulum's baseline ends at "
+    "883 ± 17, so none of its three seeds is much above 907, and their means cannot deviate by "
+    "more than 260 from 723 (311 with n − 1). Yet 723 ± 364 is printed, and all 13 overall "
+    "deviations of that task whose final one is not a copy are too large in this way. The same "
+    "bound rules out the deviation of the seeds at each evaluation, averaged over evaluations. "
+    "What is left is the deviation over evaluations, which contains the rise of the learning "
+    "curve. Final deviations are read in the same way; for these the numbers do not tell it from "
+    "a deviation of three seeds' means.",
     "A transfer is <em>positive</em> or <em>negative</em> where the 95% bootstrap interval of its "
     "mean score less the baseline's excludes 0, and <em>neutral</em> otherwise. A run gives one "
     "score. With three seeds such intervals are too short: on normal samples they hold the truth "
@@ -44,6 +46,22 @@ ABOUT = (
     "IQM is the interquartile mean of scores, which for fewer than four seeds is their mean; "
     "P(improvement) the probability that a run beats one of the baseline.",
 )
+
+
+class Section(NamedTuple):
+    """A part of the page.
+
+    Attributes:
+      id: of its anchor.
+      title: above it.
+      body: HTML.
+      entries: names of the tables and figures in it.
+    """
+
+    id: str
+    title: str
+    body: str
+    entries: tuple[str, ...] = ()
 
 
 def write_page(root: str | Path, seeds: Sequence[int], backend: Backend, path: str | Path) -> Path:
@@ -69,16 +87,17 @@ def write_page(root: str | Path, seeds: Sequence[int], backend: Backend, path: s
     cells = grid.closure(shown)
     outcomes = results.read_outcomes(root, cells)
     sections = [
-        ("reading", "How to read this", "".join(f"<p>{text}</p>" for text in ABOUT)),
+        Section("reading", "How to read this", "".join(f"<p>{text}</p>" for text in ABOUT)),
         *_chapters(tables, pictures, outcomes, root, seeds),
-        ("together", "All targets together", _together(tables, outcomes, seeds)),
-        ("videos", "Videos", _videos(root)),
-        ("contradictions", "Contradictions of the thesis", _contradictions()),
-        ("provenance", "Where the numbers come from", _provenance(root)),
+        Section("together", "All targets together", _together(tables, outcomes, seeds)),
+        Section("videos", "Videos", _videos(root)),
+        Section("contradictions", "Contradictions of the thesis", _contradictions()),
+        Section("provenance", "Where the numbers come from", _provenance(root)),
     ]
-    contents = "".join(f'<li><a href="#{id}">{title}</a></li>' for id, title, _ in sections)
+    contents = "".join(map(_contents, sections))
     body = "".join(
-        f'<section id="{id}"><h2>{title}</h2>{text}</section>' for id, title, text in sections
+        f'<section id="{section.id}"><h2>{section.title}</h2>{section.body}</section>'
+        for section in sections
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
@@ -97,6 +116,14 @@ def _text(value: object) -> str:
     return html.escape(str(value))
 
 
+def _contents(section: Section) -> str:
+    entries = ", ".join(
+        f'<a href="#{name}">{name.replace("-", " ")}</a>' for name in section.entries
+    )
+    more = f'<br><span class="muted">{entries}</span>' if entries else ""
+    return f'<li><a href="#{section.id}">{section.title}</a>{more}</li>'
+
+
 def _head(root: Path, seeds, backend: str, outcomes: Mapping[Cell, Outcome]) -> str:
     states = Counter(outcome.state for outcome in outcomes.values())
     done = sum(len(outcome.env_steps) for outcome in outcomes.values())
@@ -107,48 +134,44 @@ def _head(root: Path, seeds, backend: str, outcomes: Mapping[Cell, Outcome]) -> 
         f"<p>Preset {_text(root.name)}, {simulator}, seeds {', '.join(map(str, seeds))}. "
         f"Of {len(outcomes)} agents {states['complete']} are complete, {states['incomplete']} "
         f"incomplete and {states['missing']} have not begun; {done:,} evaluations were made.</p>"
-        + ("" if size is None else f'<p class="size">{_text(size.capitalize())}.</p>')
+        + (
+            ""
+            if size is None
+            else f'<p class="size">{_text(size.capitalize())} with the thesis.</p>'
+        )
     )
 
 
 # --- tables and figures ---------------------------------------------------------------------------
 
 
-def _chapters(tables, pictures, outcomes, root: Path, seeds) -> list[tuple[str, str, str]]:
+def _chapters(tables, pictures, outcomes, root: Path, seeds) -> list[Section]:
     """The tables and figures: targets, classification, meta-models, others."""
+    size = publication.size_note(root)
 
-    def show(*entries: Table | Figure) -> str:
-        parts = []
-        for entry in entries:
-            if isinstance(entry, Figure):
-                parts.append(_figure(entry, outcomes, root, seeds))
-            elif entry.kind == "ltc":
-                found = results.read_classification(root, entry, seeds)
-                sheet = publication.classification_sheet(entry, found, publication.size_note(root))
-                parts.append(_sheet(entry, sheet) + _latents(entry, root, seeds))
-            else:
-                size = publication.size_note(root)
-                sheet = publication.returns_sheet(entry, outcomes, seeds, size)
-                parts.append(_sheet(entry, sheet))
-        return "".join(parts)
+    def show(entry: Table | Figure) -> str:
+        if isinstance(entry, Figure):
+            return _figure(entry, outcomes, size, seeds)
+        if entry.kind == "ltc":
+            found = results.read_classification(root, entry, seeds)
+            sheet = publication.classification_sheet(entry, found, size)
+            return _sheet(entry, sheet) + _latents(entry, root, seeds)
+        return _sheet(entry, publication.returns_sheet(entry, outcomes, seeds, size))
 
-    def those(kind: str, task: str | None = None) -> list[Table | Figure]:
-        found = [table for table in tables.values() if table.kind == kind]
-        found += [figure for figure in pictures.values() if figure.kind == kind]
-        if task is None:
-            return found
-        return [e for e in found if task in (e.targets if isinstance(e, Table) else e.tasks)]
+    def section(id: str, title: str, kind: str, task: str | None = None) -> Section:
+        entries = [
+            *(t for t in tables.values() if t.kind == kind and task in (None, *t.targets)),
+            *(f for f in pictures.values() if f.kind == kind and task in (None, *f.tasks)),
+        ]
+        return Section(id, title, "".join(map(show, entries)), tuple(e.name for e in entries))
 
     return [
-        ("tasks", "The tasks", show(*those("tasks"))),
-        *(
-            (f"ftl-{task}", f"Fractional transfer to {task}", show(*those("ftl", task)))
-            for task in TASKS
-        ),
-        ("ltc", "Latent task classification", show(*those("ltc"))),
-        ("meta", "Reward meta-models", show(*those("meta"))),
-        ("baselines", "Agents from scratch", show(*those("baselines"))),
-        ("multitask", "Agents of several tasks", show(*those("multitask"))),
+        section("tasks", "The tasks", "tasks"),
+        *(section(f"ftl-{task}", f"Fractional transfer to {task}", "ftl", task) for task in TASKS),
+        section("ltc", "Latent task classification", "ltc"),
+        section("meta", "Reward meta-models", "meta"),
+        section("baselines", "Agents from scratch", "baselines"),
+        section("multitask", "Agents of several tasks", "multitask"),
     ]
 
 
@@ -200,7 +223,9 @@ def _verdict(text: str) -> str:
     return _text(text)
 
 
-def _figure(figure: Figure, outcomes: Mapping[Cell, Outcome], root: Path, seeds) -> str:
+def _figure(
+    figure: Figure, outcomes: Mapping[Cell, Outcome], size: str | None, seeds: Sequence[int]
+) -> str:
     caption = _text(figures.caption(figure))
     cells = grid.shown(figure, seeds)
     if cells and not any(outcomes[cell].env_steps for cell in cells):
@@ -211,7 +236,6 @@ def _figure(figure: Figure, outcomes: Mapping[Cell, Outcome], root: Path, seeds)
             if figure.kind == "tasks":
                 (picture,) = figures.draw_tasks(figure, stem, formats=(".png",))
             else:
-                size = publication.size_note(root)
                 (picture,) = figures.draw_curves(figure, outcomes, seeds, size, stem, (".png",))
         except ModuleNotFoundError as error:
             return _captioned(figure.name, _open(error), caption)
@@ -315,9 +339,13 @@ def _provenance(root: Path) -> str:
     """Each results folder: its agents, evaluations, revision and versions."""
     rows, versions = [], {}
     for folder in sorted({folder for folder, _ in results.folders(root).values()}):
-        header = read_json(folder / "run.json")
-        names = read_json(folder / results.CELLS)
-        found = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
+        try:
+            header = read_json(folder / "run.json")
+            names = read_json(folder / results.CELLS)
+            found = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
+        except (OSError, ValueError) as error:
+            rows.append((_text(folder.name), "-", "-", _text(error), "-"))
+            continue
         done = sum(row["kind"] == "evaluation" for row in found)
         described = ", ".join(f"{k} {v}" for k, v in header.get("versions", {}).items())
         number = versions.setdefault(described or "unknown", len(versions) + 1)
@@ -337,8 +365,8 @@ def _provenance(root: Path) -> str:
     )
     if not rows:
         return text + _open("There are none yet.")
-    header = ("Results folder", "Agents", "Evaluations", "Revision", "Versions")
+    columns = ("Results folder", "Agents", "Evaluations", "Revision", "Versions")
     listed = "".join(f"<li>{_text(described)}</li>" for described in versions)
     return (
-        text + _rows(rows, header) + f'<p class="note">Versions:</p><ol class="note">{listed}</ol>'
+        text + _rows(rows, columns) + f'<p class="note">Versions:</p><ol class="note">{listed}</ol>'
     )

@@ -193,7 +193,7 @@ def _box(entry: Entry) -> Box:
     if entry.ours is None:
         return Box(progress(entry), told, complete=False)
     verdict = None if entry.transfer is None else entry.transfer.verdict
-    return Box(f"{entry.ours[0]:.0f} ± {entry.ours[1]:.0f}", told, True, verdict)
+    return Box(f"{entry.ours[0]:z.0f} ± {entry.ours[1]:.0f}", told, True, verdict)
 
 
 def progress(entry: Entry) -> str:
@@ -206,8 +206,8 @@ def interval(estimate: Estimate | None, digits: int = 0) -> str:
     if estimate is None:
         return "-"
     if estimate.low is None:
-        return f"{estimate.value:.{digits}f}"
-    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+        return f"{estimate.value:z.{digits}f}"
+    return f"{estimate.value:z.{digits}f} [{estimate.low:z.{digits}f}, {estimate.high:z.{digits}f}]"
 
 
 def _statistics(table: Table, entries) -> tuple[tuple[str, ...], ...]:
@@ -231,13 +231,13 @@ def _statistics(table: Table, entries) -> tuple[tuple[str, ...], ...]:
             words[0] = interval(transfer.difference)
             words[1] = transfer.verdict or "one seed"
             words[3] = interval(transfer.improvement, 2)
-            words[4] = f"{transfer.jumpstart:+.0f}"
+            words[4] = f"{transfer.jumpstart:+z.0f}"
         elif entry.sources is not None:
             words[1] = "baseline incomplete"
         if entry.threshold is not None:
             steps = entry.threshold.env_steps
             reached = "never" if steps is None else f"{steps:,}"
-            words[5] = f"{reached} ({entry.threshold.value:.0f})"
+            words[5] = f"{reached} ({entry.threshold.value:z.0f})"
         rows.append((name, *words))
     return tuple(rows)
 

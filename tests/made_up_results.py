@@ -2,8 +2,6 @@
 
 import json
 
-import numpy as np
-
 import envs
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
@@ -55,12 +53,3 @@ def write_folder(root, name, cells, returns, config=None, done=None):
                 )
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder
-
-
-def learning_curve(cell, task, count):
-    """Returns [count] that rise from about -800 to about 850, sooner with more knowledge."""
-    random = np.random.default_rng([*cell.name.encode()])
-    gain = {"scratch": 0.0, "uae": 0.1, "meta": 0.3}.get(cell.method, 0.6 - (cell.omega or 0.0))
-    progress = np.linspace(0, 1, count) * (4 + 6 * gain) + 0.8 * gain
-    level = 850 - 1650 * np.exp(-progress)
-    return level + random.normal(0, 60) + random.normal(0, 90, count)
