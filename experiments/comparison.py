@@ -39,7 +39,7 @@ class Transfer:
 
     @property
     def verdict(self) -> statistics.Verdict | None:
-        """Positive, neutral or negative transfer; None where a single seed gives no interval."""
+        """Positive, neutral or negative transfer; None where there is no interval to judge by."""
         return statistics.verdict(self.difference)
 
 

@@ -229,7 +229,7 @@ def _statistics(table: Table, entries) -> tuple[tuple[str, ...], ...]:
         words = ["-", "-", interval(entry.average), "-", "-", "-"]
         if (transfer := entry.transfer) is not None:
             words[0] = interval(transfer.difference)
-            words[1] = transfer.verdict or "one seed"
+            words[1] = transfer.verdict or "no interval"
             words[3] = interval(transfer.improvement, 2)
             words[4] = f"{transfer.jumpstart:+z.0f}"
         elif entry.sources is not None:

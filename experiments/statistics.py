@@ -27,7 +27,7 @@ Verdict = Literal["positive", "neutral", "negative"]
 
 
 class Estimate(NamedTuple):
-    """A value and its interval; the ends are None where there are too few runs for one."""
+    """A value and its interval; no ends where a group has one run, or a value is not finite."""
 
     value: float
     low: float | None
@@ -68,7 +68,7 @@ def bootstrap(
     """
     strata = [np.asarray(scores, float) for scores in strata]
     value = float(statistic(*strata, axis=-1))
-    if any(len(scores) < 2 for scores in strata):
+    if not math.isfinite(value) or any(len(scores) < 2 for scores in strata):
         return Estimate(value, None, None)
     interval = stats.bootstrap(
         strata,
@@ -104,7 +104,8 @@ def difference(one: np.ndarray, other: np.ndarray, generator: np.random.Generato
 def verdict(change: Estimate) -> Verdict | None:
     """What an interval of the difference to the baseline says of a transfer (section 2.4.1).
 
-    "positive" or "negative" if 0 lies outside of the interval, "neutral" if not; None without one.
+    "positive" or "negative" if 0 lies outside of the interval, "neutral" if not; None without an
+    interval.
     """
     if change.low is None:
         return None

@@ -5,6 +5,7 @@ The runs are made up; see `made_up_results`.
 
 import base64
 import csv
+import dataclasses
 import re
 from collections import namedtuple
 
@@ -251,7 +252,7 @@ def test_a_single_seed_has_numbers_and_no_verdict(root):
     sheet = publication.returns_sheet(TABLES["table-7"], outcomes, SEEDS[:1], None)
     box = sheet.rows[0][1][0]
     assert box.complete and box.verdict is None
-    assert any(row[1:3] == ("100", "one seed") for row in sheet.statistics)
+    assert any(row[1:3] == ("100", "no interval") for row in sheet.statistics)
 
 
 # --- latent task classification -------------------------------------------------------------------
@@ -323,14 +324,15 @@ def test_captions_follow_the_grid():
 
 
 def test_learning_curves_are_drawn_with_incomplete_ones_labelled(root, tmp_path):
-    paths = publication.write_figure(FIGURES["figure-21"], root, SEEDS, tmp_path / "out")
+    figure = dataclasses.replace(FIGURES["figure-21"], omegas=(0.0, 0.1, 0.2))
+    paths = publication.write_figure(figure, root, SEEDS, tmp_path / "out")
     assert [path.name for path in paths] == ["figure-21.png", "figure-21.svg"]
     assert paths[0].read_bytes().startswith(b"\x89PNG")
     # The SVG names each text in a comment.
     labels = re.findall(r"<!-- (.*?) -->", paths[1].read_text(encoding="utf-8"))
-    assert labels.count("transfer") == 1 and labels.count("baseline") == 6
+    assert labels.count("transfer") == 1 and labels.count("baseline") == 3
     assert labels.count("transfer, incomplete: 4 of 8 evaluations") == 1
-    assert labels.count("transfer, not run") == 4
+    assert labels.count("transfer, not run") == 1
     assert any("preset debug: not comparable in size" in label for label in labels)
 
 

@@ -192,6 +192,11 @@ def test_a_transfer_is_judged_by_whether_its_interval_excludes_zero():
     assert statistics.verdict(Estimate(-2.0, -4.0, -0.1)) == "negative"
 
 
+def test_a_return_that_is_not_finite_gives_no_verdict():
+    change = statistics.difference(np.array([math.nan, 1.0]), np.array([1.0, 2.0]), draws())
+    assert math.isnan(change.value) and statistics.verdict(change) is None
+
+
 @pytest.mark.parametrize("shift, verdict", [(100, "positive"), (0, "neutral"), (-100, "negative")])
 def test_a_shift_beyond_the_spread_is_a_transfer(shift, verdict):
     baseline = np.array([10.0, 14.0, 12.0])
