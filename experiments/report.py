@@ -2,8 +2,7 @@
 
 Returns are those of the evaluations (section 4.2.3): "overall" is the mean over all evaluations
 of a run, "final" over those in the last tenth of its environment steps. The deviation is that of
-all these returns, of all seeds together, as in the thesis: its overall deviations are as large as
-the learning curves are steep, which a deviation over three seeds' means could not be.
+all these returns, of all seeds together, as in the thesis (see `statistics.mean_and_deviation`).
 """
 
 import re
@@ -18,8 +17,7 @@ import envs
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
 from experiments.spec import BASELINE, RunSpec, read_spec
-
-FINAL_SHARE = 0.1
+from experiments.statistics import FINAL_SHARE, mean_and_deviation
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,8 @@ def evaluations(directory: str | Path) -> list[dict[str, Any]]:
     return [row for row in read_metrics(directory) if row["kind"] == "evaluation"]
 
 
-def _statistics(returns: Sequence[float]) -> tuple[float, float] | None:
-    return (float(np.mean(returns)), float(np.std(returns))) if len(returns) else None
+def _statistics(rows: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
+    return mean_and_deviation([row["return"] for row in rows]) if rows else None
 
 
 def labels(spec: RunSpec) -> list[str]:
@@ -76,8 +74,8 @@ def summarise(directory: str | Path) -> list[Summary]:
                     seeds=seeds,
                     done=len(chosen),
                     planned=seeds * schedule.evaluations,
-                    overall=_statistics([row["return"] for row in chosen]),
-                    final=_statistics([row["return"] for row in late]),
+                    overall=_statistics(chosen),
+                    final=_statistics(late),
                 )
             )
     return summaries

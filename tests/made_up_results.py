@@ -1,0 +1,55 @@
+"""Results folders of runs that never were: made-up returns in the files that real runs write."""
+
+import json
+
+import envs
+from dreamer_jax.config import preset
+from dreamer_jax.files import write_json_atomically
+from dreamer_jax.schedule import Schedule
+from experiments.figures import task_name
+from experiments.spec import RunSpec
+
+VERSIONS = {"python": "3.11.7", "jax": "0.10.2", "backend": "cpu"}
+
+
+def evaluation_steps(config, tasks=1):
+    """Environment steps at each evaluation of a run."""
+    schedule = Schedule(config.schedule, tasks)
+    every = config.schedule.evaluate_every
+    rounds = range(schedule.prefill_rounds, schedule.rounds + 1)
+    first_round = {schedule.environment_steps(r) // every: r for r in reversed(rounds)}
+    return [schedule.environment_steps(r) for bin, r in sorted(first_round.items()) if bin]
+
+
+def write_folder(root, name, cells, returns, config=None, done=None):
+    """A results folder of a population.
+
+    Args:
+      root: the folder that it is in.
+      name: of the folder.
+      cells: of the members, all on the same tasks.
+      returns: from a cell, a title of a task and the number of evaluations E to returns [E].
+      config: settings, by default of the preset that the root is named after.
+      done: evaluations made; by default all.
+    """
+    config = preset(root.name) if config is None else config
+    tasks = tuple(task_name(cells[0].backend, title) for title in cells[0].tasks)
+    spec = RunSpec(tasks, tuple(range(len(cells))), config)
+    steps = evaluation_steps(config, len(tasks))
+    folder = root / name
+    folder.mkdir(parents=True)
+    write_json_atomically(folder / "cells.json", [cell.name for cell in cells])
+    write_json_atomically(
+        folder / "run.json", {"spec": spec.to_dict(), "versions": VERSIONS, "revision": "0" * 40}
+    )
+    rows = []
+    for member, cell in enumerate(cells):
+        for task in tasks:
+            values = returns(cell, envs.spec(task).title, len(steps))
+            for env_steps, value in list(zip(steps, values, strict=True))[:done]:
+                rows.append(
+                    {"kind": "evaluation", "member": member, "task": task}
+                    | {"env_steps": env_steps, "updates": env_steps, "return": float(value)}
+                )
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
