@@ -38,10 +38,11 @@ class Train:
     """One agent per seed; all train as one population."""
     preset: Literal["thesis", "cpu", "demo", "debug"] = "cpu"
     """Settings to start from; each can be overridden by its name below."""
-    source: Path | None = None
-    """Results folder of the agent to transfer from."""
+    source: tuple[Path, ...] = ()
+    """Results folder of the agent to transfer from. Fractional transfer takes several: each has
+    targets of its own in the population."""
     source_member: int = 0
-    """Which member of the source's population."""
+    """Which member of each source's population."""
     omega: tuple[float, ...] = ()
     """Fractions of the source's last reward and value layers to add (0 to 1)."""
     baseline: bool = False
@@ -244,7 +245,7 @@ def _train(command: Train) -> int:
             tasks=command.task,
             seeds=command.seeds,
             config=command.config,
-            source=None if command.source is None else str(command.source),
+            sources=tuple(map(str, command.source)),
             source_member=command.source_member,
             omegas=command.omega,
             baseline=command.baseline,
@@ -259,7 +260,7 @@ def _train(command: Train) -> int:
             threshold=command.threshold,
         )
         run = make_run(spec, command.out, resume=command.resume, workers=command.workers)
-    if spec.source is not None:
+    if spec.sources:
         print((command.out / "transfer.txt").read_text())
     if carry_out(run) == "stopped":
         print(f"stopped and saved in {command.out}: the same command with --resume continues")

@@ -31,7 +31,7 @@ def specs(directory: Path, config: Config) -> dict[str, RunSpec]:
             (TARGET_TASK,),
             SEEDS,
             config,
-            source=str(directory / "source"),
+            sources=(str(directory / "source"),),
             omegas=OMEGAS,
             baseline=True,
         ),

@@ -17,9 +17,8 @@ CONFIG = preset("debug")
 def spec_of(*tasks, seeds=(0,), config=CONFIG, **settings) -> RunSpec:
     """A spec for tasks named without their backend."""
     names = tuple(f"bullet/{task}" for task in tasks)
-    settings = {k: str(v) if k == "source" else v for k, v in settings.items()}
-    if "reward_sources" in settings:
-        settings["reward_sources"] = tuple(map(str, settings["reward_sources"]))
+    for name in {"sources", "reward_sources"} & set(settings):
+        settings[name] = tuple(map(str, settings[name]))
     return RunSpec(names, seeds, config, **settings)
 
 
@@ -38,7 +37,7 @@ def write_run(directory, spec: RunSpec, seed=0) -> Source:
     """
     params = random_params(make_agent(spec), seed)
     if spec.method == "uae":
-        source = load_source(spec.source)
+        source = load_source(spec.sources[0])
         given, claims = transfer.flatten(source.params), transfer.claims(plan(spec), params)
         copied = [path for path, rule in claims.items() if rule.operation == "copy"]
         params = transfer.unflatten(params, {path: given[path] for path in copied})
