@@ -4,7 +4,9 @@ A run whose folder is damaged is set aside: renamed, never deleted. Those that n
 the next time.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+import fcntl
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -79,12 +81,43 @@ def carry_out_runs(
       workers: simulator processes; by default one per core.
       train: what trains one run.
       say: where messages go.
+
+    Raises:
+      ValueError: another process trains runs under the same root.
     """
     root, progress = Path(root), Progress()
-    for run in runs:
-        if run.state == "corrupt":
-            progress.failed[run.name] = _aside(root / run.name, run.problem)
     due = [run for run in runs if run.state in ("missing", "cut")]
+    with _alone(root) if due else contextlib.nullcontext():
+        for run in runs:
+            if run.state == "corrupt":
+                progress.failed[run.name] = _aside(root / run.name, run.problem)
+        _carry_out(due, root, progress, workers, train, say)
+    return progress
+
+
+@contextlib.contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Keeps other processes from training runs under a root, until this one is done or dead."""
+    root.mkdir(parents=True, exist_ok=True)
+    with open(root / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"another command is training in {root}: wait until it is done, or name another "
+                "folder with --results"
+            ) from None
+        yield
+
+
+def _carry_out(
+    due: list[PlannedRun],
+    root: Path,
+    progress: Progress,
+    workers: int | None,
+    train: Train,
+    say: Callable[[str], None],
+) -> None:
     checked: set[str] = set()
     for number, run in enumerate(due, start=1):
         _check_needs(run, root, progress, checked)
@@ -96,17 +129,17 @@ def carry_out_runs(
         try:
             outcome = train(run, root, workers)
         except (ValueError, CorruptCheckpointError) as error:
-            folder = root / run.name
-            begun_ = begun(folder)
-            progress.failed[run.name] = _aside(folder, str(error)) if begun_ else str(error)
+            damaged = begun(root / run.name)
+            progress.failed[run.name] = (
+                _aside(root / run.name, str(error)) if damaged else str(error)
+            )
         except (SimulatorError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
             progress.failed[run.name] = f"{error} (it is kept as it is; the same command goes on)"
         else:
             if outcome == "stopped":
                 progress.stopped = True
-                return progress
+                return
             progress.finished.append(run.name)
-    return progress
 
 
 def _described(run: PlannedRun) -> str:

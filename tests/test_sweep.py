@@ -124,6 +124,15 @@ def test_a_source_with_damaged_parameters_is_set_aside_and_not_its_targets(tmp_p
     assert list(progress.skipped) == [HOPPER] and HOPPER not in trained
 
 
+def test_two_sweeps_at_once_are_refused(tmp_path):
+    def train(run, root, workers):
+        with pytest.raises(ValueError, match="another command is training in .*--results"):
+            sweep(tmp_path)
+        return Trainer()(run, root, workers)
+
+    assert carry_out_runs(plan(tmp_path), tmp_path, train=train, say=lambda _: None).complete
+
+
 # --- what it will take ------------------------------------------------------------------------
 
 SPEED = Speed(
