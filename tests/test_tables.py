@@ -134,6 +134,17 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, 
     assert {row["label"] for row in read_metrics(root / targets.name)} == {"sources=2"}
 
 
+def test_a_report_of_all_results_is_of_what_there_is_something_of(root, written):
+    before = metrics(root)
+    assert main(["report", str(root), "--seeds", "0", "1"]) == 0
+    # Baselines of InvertedPendulum are beside its targets, meta-models and source agents.
+    assert [entry.name for entry in written] == [
+        *(f"table-{number}" for number in (7, 8, 16, 17)),
+        *(f"figure-{number}" for number in (21, 22, 23, 33, 36, 37, 38, 39)),
+    ]
+    assert metrics(root) == before
+
+
 @pytest.fixture(scope="module")
 def classified(tmp_path_factory):
     """Results whose universal autoencoder has not trained, and Table 13 made from it."""
