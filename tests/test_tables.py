@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from runs import CONFIG, finish, write_run
 
+import envs
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from experiments import grid, grid_commands, latent_tables
@@ -180,17 +181,11 @@ def test_shares_are_those_of_the_tables_with_thresholds_scaled_to_the_features(c
     found = read_json(latents_folder(classified, "bullet", 0) / "table-13.json")
     for share in shares:
         assert share.known == (share.task in table.known)
-        (name,) = (task for task in found["distances"] if grid_title(task) == share.task)
+        (name,) = (task for task in found["distances"] if envs.spec(task).title == share.task)
         near = np.array(found["distances"][name]) <= share.scaled
         assert share.not_novel == pytest.approx(near.mean())
         if not share.known:
             assert share.correct == pytest.approx(1 - near.mean(), abs=1e-6)
-
-
-def grid_title(name):
-    import envs
-
-    return envs.spec(name).title
 
 
 def test_a_table_of_latent_states_that_is_not_made_is_none(classified):
