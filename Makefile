@@ -1,22 +1,29 @@
-# Every target sets up .venv by itself. Settings: make train TASK="bullet/hopper" SEEDS="0 1 2".
+# Every target sets up .venv by itself. Settings: make train TASK="bullet/hopper" SEEDS="0 1 2",
+# make table-3 PRESET=thesis SEEDS="0 1", make plan TABLE="3 4" FIGURE=12.
 PYTHON ?= python3
 PRESET ?= cpu
 TASK   ?= bullet/inverted_pendulum
 SEEDS  ?= 0 1 2
 OMEGA  ?= 0 0.1 0.2 0.3 0.4 0.5
 SOURCE ?=
+BACKEND ?= bullet
+RESULTS ?= results
+TABLE  ?=
+FIGURE ?=
 OUT    ?= runs/$(subst /,_,$(firstword $(TASK)))-$(PRESET)
 ARGS   ?=
+
+GRID    = --preset $(PRESET) --seeds $(SEEDS) --backend $(BACKEND) --results $(RESULTS)
 
 VENV   := .venv
 RUN    := $(VENV)/bin/python
 STAMP   = $(VENV)/.installed-
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint train sweep evaluate report bench clean
+.PHONY: help setup demo test lint tables figures plan train sweep evaluate report bench clean
 
 help:  ## List the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | \
+	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/%/N/; s/:.*## /|/' | \
 	  awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
 
 # One stamp per set of extras, so that the demo installs no test tools.
@@ -33,7 +40,22 @@ comma := ,
 setup: $(STAMP)bullet+gymnasium+dev  ## Set up .venv with everything
 
 demo: $(STAMP)bullet  ## Train a source, transfer it to eight targets, show what came of it (15 minutes)
-	$(RUN) -m experiments demo --out runs/demo $(ARGS)
+	$(RUN) -m experiments demo --results $(RESULTS) $(ARGS)
+
+table-%: $(STAMP)$(BACKEND)  ## Make Table N of the thesis from our runs: train what is missing, resume, show
+	$(RUN) -m experiments table $* $(GRID) $(ARGS)
+
+figure-%: $(STAMP)$(BACKEND)  ## Make Figure N of the thesis in the same way
+	$(RUN) -m experiments figure $* $(GRID) $(ARGS)
+
+tables: $(STAMP)$(BACKEND)  ## Make all tables
+	$(RUN) -m experiments table all $(GRID) $(ARGS)
+
+figures: $(STAMP)$(BACKEND)  ## Make all figures
+	$(RUN) -m experiments figure all $(GRID) $(ARGS)
+
+plan: $(STAMP)$(BACKEND)  ## Show the runs behind TABLE and FIGURE (numbers, or all) and what they will take
+	$(RUN) -m experiments plan $(if $(TABLE),--table $(TABLE)) $(if $(FIGURE),--figure $(FIGURE)) $(GRID) $(ARGS)
 
 test: $(STAMP)bullet+gymnasium+dev  ## Run the test suite (10 minutes)
 	$(RUN) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
@@ -59,5 +81,5 @@ report: $(STAMP)bullet  ## Print the table of OUT and draw its learning curves
 bench: $(STAMP)bullet+gymnasium+dev  ## Run the benchmarks and write runs/benchmarks/table.md (an hour)
 	$(RUN) -m benchmarks runs/benchmarks $(ARGS)
 
-clean:  ## Remove .venv and caches; runs/ stays
+clean:  ## Remove .venv and caches; runs/ and results/ stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis *.egg-info

@@ -25,7 +25,7 @@ KNOWN_SAMPLES = 100
 
 def plan(spec: RunSpec) -> transfer.Plan | None:
     """What a run's method does to each leaf of a fresh agent; none for one from scratch."""
-    if spec.source is None:
+    if not spec.sources:
         return None
     if spec.method == "fractional":
         return fractional_transfer(fractions=spec.fractions)

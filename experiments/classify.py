@@ -6,7 +6,7 @@ Axis letters: K task, S samples, M latent feature size.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -155,16 +155,39 @@ def classify(
             report=report,
         )
         gathered |= dict(zip(played, found, strict=True))
-    # No episode goes from one phase on to the next, so none is in both halves.
-    drawn = {
-        task: [half.draw(samples, seed) for half in latents.halves()]
-        for task, latents in gathered.items()
-    }
-    fitted, tested = {task: drawn[task][0] for task in known}, {t: x[1] for t, x in drawn.items()}
-    return _judge(tasks, known, fitted, tested, thresholds, neighbours, quantile)
+    drawn = {task: draw(latents, samples, seed) for task, latents in gathered.items()}
+    return judge(
+        tasks, known, drawn, thresholds=thresholds, neighbours=neighbours, quantile=quantile
+    )
 
 
-def _judge(tasks, known, fitted, tested, thresholds, neighbours, quantile) -> Outcome:
+def draw(latents: Latents, samples: int, seed: int) -> tuple[Latents, Latents]:
+    """S latent states of a task to fit on, and S to test: of the two halves of its phases.
+
+    No episode goes from one phase on to the next, so none is in both.
+    """
+    fitted, tested = (half.draw(samples, seed) for half in latents.halves())
+    return fitted, tested
+
+
+def judge(
+    tasks: Sequence[str],
+    known: Sequence[str],
+    drawn: Mapping[str, tuple[Latents, Latents]],
+    *,
+    thresholds: Sequence[float] = (),
+    neighbours: int = ltc.NEIGHBOURS,
+    quantile: float = 0.95,
+) -> Outcome:
+    """Fits a classifier on samples of the known tasks, and tests it on others of all tasks.
+
+    Args:
+      drawn: of each task, what `draw` gives.
+      tasks, known, thresholds, neighbours, quantile: see `classify`.
+    """
+    tasks, known = tuple(tasks), tuple(known)
+    fitted = {task: drawn[task][0] for task in known}
+    tested = {task: drawn[task][1] for task in tasks}
     labels = np.concatenate([[i] * len(fitted[task].episodes) for i, task in enumerate(known)])
     model = ltc.fit(
         np.concatenate([fitted[task].features for task in known]), labels, neighbours=neighbours

@@ -69,6 +69,8 @@ class Cell:
             words += ["from", "+".join(self.source.tasks), f"omega={self.omega:g}"]
         elif self.method == "meta":
             words += ["from", "+".join(source.tasks[0] for source in self.reward_sources)]
+        if self.source is not None:
+            words.append(f"source-seed={self.source.seed}")
         return " ".join([*words, f"seed={self.seed}"])
 
     @property

@@ -1,10 +1,11 @@
 """The thesis's methods on whole populations: fresh agents and sources -> targets to train.
 
-Axis letters: P population member, N source, M latent feature size, S samples.
+Axis letters: P population member, N source or stored model, M latent feature size, S samples.
 """
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -32,28 +33,32 @@ class Sources:
     """All agents that a run takes knowledge from.
 
     Attributes:
-      agent: the one that parameters are transferred from.
+      agents: those that parameters are transferred from; one but for fractional transfer.
       stored: those whose models a meta-model reads; none for other methods.
     """
 
-    agent: Source
+    agents: tuple[Source, ...]
     stored: tuple[Source, ...] = ()
 
 
-def load_sources(spec: RunSpec) -> Sources:
+def load_sources(spec: RunSpec, base: str | Path = "") -> Sources:
     """Reads the agents that a run needs, and checks that they fit it.
+
+    Args:
+      spec: of the run.
+      base: the folder that the spec's relative paths start from; by default the working directory.
 
     Raises:
       ValueError: a folder holds no run or no checkpoint; sizes differ; a stored model was not
         trained on what the target keeps frozen, or is no plain model.
     """
-    agent = load_source(spec.source, spec.source_member)
-    check_source(agent, spec)
-    stored = tuple(load_source(directory) for directory in spec.reward_sources)
-    for one in stored:
+    agents = tuple(load_source(Path(base) / path, spec.source_member) for path in spec.sources)
+    stored = tuple(load_source(Path(base) / path) for path in spec.reward_sources)
+    for one in (*agents, *stored):
         check_source(one, spec)
-        _check_stored(one, agent, spec)
-    return Sources(agent, stored)
+    for one in stored:
+        _check_stored(one, agents[0], spec)
+    return Sources(agents, stored)
 
 
 def _check_stored(stored: Source, agent: Source, spec: RunSpec) -> None:
@@ -97,12 +102,14 @@ def transferred_members(
     agent, members = make_agent(spec), spec.members
     seeds = jnp.array([member.seed for member in members], jnp.int32)
     parameters: dict[str, Any] = {}
-    count, knowledge = len(members), sources.agent.params
+    count, knowledge, own = len(members), sources.agents[0].params, None
     if spec.method == "fractional":
         # Members from scratch come last.
-        count = len(spec.omegas) * len(spec.seeds)
+        count = len(spec.sources) * len(spec.omegas) * len(spec.seeds)
         omegas = [member.tags["omega"] for member in members[:count]]
         parameters["omega"] = jnp.array(omegas, jnp.float32)
+        knowledge = _stacked(spec, sources.agents)
+        own = jnp.repeat(jnp.arange(len(spec.sources)), len(spec.omegas) * len(spec.seeds))
     elif spec.method == "meta":
         stored = stored_models(spec, sources.stored, action_size=agent.action_size)
         if spec.switching:
@@ -111,8 +118,10 @@ def transferred_members(
         knowledge = {"autoencoder": knowledge, "stored": stored}
 
     @jax.jit
-    def start(seeds, knowledge, parameters):
+    def start(seeds, knowledge, own, parameters):
         fresh = jax.vmap(agent.init)(seeds).params
+        if own is not None:
+            knowledge = jax.tree.map(lambda x: x[own], knowledge)
         targets, report = transfer.apply(
             plan(spec),
             jax.tree.map(lambda x: x[:count], fresh),
@@ -123,7 +132,30 @@ def transferred_members(
         join = lambda new, old: jnp.concatenate([new, old[count:]])  # noqa: E731
         return jax.vmap(agent.start)(jax.tree.map(join, targets, fresh), seeds), report
 
-    return start(seeds, knowledge, parameters)
+    return start(seeds, knowledge, own, parameters)
+
+
+def _stacked(spec: RunSpec, sources: Sequence[Source]) -> dict[str, Any]:
+    """What fractional transfer reads of its sources, by path: leaves [N, ...].
+
+    Leaves that it does not read, those that handle actions, are left out: sources may differ in
+    their shapes.
+
+    Raises:
+      ValueError: a leaf that is read has another shape in another source.
+    """
+    fresh = jax.eval_shape(make_agent(spec).init_params, jax.random.key(0))
+    read = [p for p, rule in transfer.claims(plan(spec), fresh).items() if rule.operation != "keep"]
+    flat = [transfer.flatten(source.params) for source in sources]
+    for path in read:
+        for source, leaves in zip(sources, flat, strict=True):
+            shapes = [np.shape(x[path]) if path in x else "absent" for x in (flat[0], leaves)]
+            if shapes[0] != shapes[1]:
+                raise ValueError(
+                    f"{path} is {shapes[0]} in the source {sources[0].directory} and {shapes[1]} "
+                    f"in {source.directory}: targets of one population need sources of one shape"
+                )
+    return {path: np.stack([x[path] for x in flat]) for path in read if path in flat[0]}
 
 
 def stored_models(

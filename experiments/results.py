@@ -2,21 +2,27 @@
 
 A run's folder holds cells.json beside what `experiments.run` writes: the names of its cells, in
 the order of its members. Nothing else says where a cell is, so that folders may be copied to
-another machine and read there.
+another machine and read there. A folder that cannot be read is warned of, and its cells count as
+missing.
 """
 
+import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import envs
+from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.grid import Cell
-from experiments.spec import read_spec
+from experiments.grid import SEEDS, THRESHOLDS, Backend, Cell, Table
+from experiments.spec import RunSpec, read_spec
 
 CELLS = "cells.json"
+
+_SET_ASIDE = re.compile(r"\.corrupt-\d+$")
 
 
 @dataclass(frozen=True)
@@ -45,29 +51,111 @@ class Outcome:
         return "complete" if len(self.env_steps) >= self.planned else "incomplete"
 
 
+@dataclass(frozen=True)
+class Share:
+    """How well latent states of one task were told, at one threshold (section 4.3.3).
+
+    Attributes:
+      threshold: ξ of the thesis, for 230 features; None for the one suggested by the samples.
+      scaled: what was applied, ξ · M / 230.
+      task: title.
+      known: whether the classifier was fitted on the task.
+      not_novel: share of the samples that were not taken for novel.
+      correct: of a novel task, the share taken for novel; of a known one, the share that was
+        neither taken for novel nor for another task.
+      right_task: share whose neighbours vote for the right task; 0 for a novel one.
+    """
+
+    threshold: float | None
+    scaled: float
+    task: str
+    known: bool
+    not_novel: float
+    correct: float
+    right_task: float
+
+
+@dataclass(frozen=True)
+class Classification:
+    """What a table of latent task classification shows.
+
+    Attributes:
+      table: which one.
+      samples: of each task that the classifier was tested on, and fitted on.
+      feature_size: M.
+      shares: for each threshold, the suggested one last, and each task, novel ones first.
+    """
+
+    table: Table
+    samples: int
+    feature_size: int
+    shares: tuple[Share, ...]
+
+
+def run_folders(root: str | Path) -> list[Path]:
+    """The folders under a root that hold a run of cells that has begun, set-aside ones left out."""
+    found = sorted(path.parent for path in Path(root).glob(f"*/{CELLS}"))
+    return [path for path in found if not _SET_ASIDE.search(path.name) and begun(path)]
+
+
+def begun(folder: Path) -> bool:
+    """Whether a folder holds more of a run than what it was going to be."""
+    metrics = folder / "metrics.jsonl"
+    if metrics.exists() and metrics.stat().st_size > 0:
+        return True
+    return Checkpointer(folder / "checkpoints").latest() is not None
+
+
+def set_aside(folder: Path) -> Path:
+    """Renames a folder that cannot be used, so that nothing reads it and its name is free.
+
+    Returns:
+      What it is called now.
+    """
+    number = 1
+    while (path := folder.with_name(f"{folder.name}.corrupt-{number}")).exists():
+        number += 1
+    return folder.rename(path)
+
+
+def read_cells(folder: Path) -> tuple[str, ...]:
+    """The names of a run's cells, in the order of its members.
+
+    Raises:
+      ValueError: cells.json is damaged.
+    """
+    names = read_json(folder / CELLS)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{folder / CELLS} is no list of names")
+    return tuple(names)
+
+
 def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
     """Where each cell is: its name -> (results folder, member)."""
     found = {}
-    for path in sorted(Path(root).glob(f"*/{CELLS}")):
-        for member, name in enumerate(read_json(path)):
-            found.setdefault(name, (path.parent, member))
+    for folder in run_folders(root):
+        try:
+            names = read_cells(folder)
+        except ValueError as error:
+            warnings.warn(f"{error}: its cells count as missing", stacklevel=2)
+            continue
+        for member, name in enumerate(names):
+            found.setdefault(name, (folder, member))
     return found
 
 
 def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome]:
     """The outcome of each cell, those that have not begun included."""
-    places, read = folders(root), {}
+    places = folders(root)
+    read: dict[Path, tuple[RunSpec, list[dict]] | None] = {}
     outcomes = {}
     for cell in cells:
-        if cell.name not in places:
+        folder, member = places.get(cell.name, (None, 0))
+        if folder is not None and folder not in read:
+            read[folder] = _read_run(folder)
+        if folder is None or read[folder] is None:
             outcomes[cell] = Outcome(cell)
             continue
-        folder, member = places[cell.name]
-        if folder not in read:
-            read[folder] = (
-                read_spec(folder),
-                [row for row in read_metrics(folder) if row["kind"] == "evaluation"],
-            )
         spec, rows = read[folder]
         schedule = Schedule(spec.config.schedule, len(spec.tasks))
         returns: dict[str, list[float]] = {}
@@ -84,3 +172,52 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
             schedule.environment_steps(schedule.rounds),
         )
     return outcomes
+
+
+def _read_run(folder: Path) -> tuple[RunSpec, list[dict]] | None:
+    """A run's spec and the rows of its evaluations; a warning and nothing if it cannot be read."""
+    try:
+        rows = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
+        return read_spec(folder), [row for row in rows if row["kind"] == "evaluation"]
+    except (ValueError, KeyError, TypeError) as error:
+        warnings.warn(
+            f"{folder} cannot be read ({error}): its cells count as missing", stacklevel=3
+        )
+        return None
+
+
+def latents_folder(root: str | Path, backend: Backend, seed: int) -> Path:
+    """Where latent states of all tasks and what was told of them are."""
+    return Path(root) / f"latents-{backend}-seed-{seed}"
+
+
+def read_classification(
+    root: str | Path, table: Table, seeds: tuple[int, ...] = SEEDS
+) -> Classification | None:
+    """What a table of latent task classification shows; None if that is not done yet."""
+    path = latents_folder(root, table.backend, seeds[0]) / f"{table.name}.json"
+    if not path.exists():
+        return None
+    try:
+        found = read_json(path)
+        rows = {
+            (row["threshold"], envs.spec(row["task"]).title): row for row in found["accuracies"]
+        }
+        scaled = dict.fromkeys(row["threshold"] for row in found["accuracies"])
+        shares = tuple(
+            Share(
+                threshold=threshold,
+                scaled=applied,
+                task=task,
+                known=task in table.known,
+                not_novel=rows[applied, task]["not_novel"],
+                correct=rows[applied, task]["correct"],
+                right_task=rows[applied, task]["right_task"],
+            )
+            for threshold, applied in zip((*THRESHOLDS, None), scaled, strict=True)
+            for task in (*table.targets, *table.known)
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        warnings.warn(f"{path} cannot be read ({error}): delete it to make it anew", stacklevel=2)
+        return None
+    return Classification(table, found["samples"], found["feature_size"], shares)

@@ -8,6 +8,7 @@ transfer.json.
 import importlib.metadata
 import json
 import platform
+import subprocess
 from pathlib import Path
 from typing import Literal
 
@@ -34,8 +35,29 @@ def _versions() -> dict[str, str]:
     return versions
 
 
+def _revision() -> str:
+    """The commit of the source tree, marked if it was changed since; else the package's version."""
+    tree = Path(__file__).parent.parent
+    if (tree / ".git").exists():
+        command = ["git", "-C", str(tree), "describe", "--always", "--dirty"]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            return done.stdout.strip()
+        except (OSError, subprocess.CalledProcessError):
+            pass  # no git here, or a tree that is not its to read
+    try:
+        return importlib.metadata.version("dreamer-transfer")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
 def make_run(
-    spec: RunSpec, directory: str | Path, *, resume: bool = False, workers: int | None = None
+    spec: RunSpec,
+    directory: str | Path,
+    *,
+    resume: bool = False,
+    workers: int | None = None,
+    base: str | Path = "",
 ) -> Run:
     """Prepares a run: simulators, agents, and the results folder.
 
@@ -44,6 +66,7 @@ def make_run(
       directory: the results folder.
       resume: continue what the folder holds.
       workers: simulator processes; by default one per core.
+      base: the folder that the spec's relative paths start from; by default the working directory.
 
     Raises:
       ValueError: the folder holds another run, or a source does not fit.
@@ -63,8 +86,8 @@ def make_run(
                 f"{directory} already holds this run: add --resume, or choose another folder"
             )
     state, report = None, None
-    if spec.source is not None and Checkpointer(directory / "checkpoints").latest() is None:
-        state, report = transferred_members(spec, load_sources(spec), workers=workers)
+    if spec.sources and Checkpointer(directory / "checkpoints").latest() is None:
+        state, report = transferred_members(spec, load_sources(spec, base), workers=workers)
     agent = make_agent(spec)
     env = make_env(spec, workers=workers)
     try:
@@ -73,7 +96,8 @@ def make_run(
             write_report(report, directory)
         # Written last: what has a header can be resumed.
         if not header.exists():
-            write_json_atomically(header, {"spec": spec.to_dict(), "versions": _versions()})
+            made_with = {"versions": _versions(), "revision": _revision()}
+            write_json_atomically(header, {"spec": spec.to_dict(), **made_with})
         return Run(agent, env, spec.tasks, spec.members, directory, state=state, resume=True)
     except BaseException:
         env.close()

@@ -29,9 +29,10 @@ class RunSpec:
       tasks: names of the K tasks; several make a multi-task agent.
       seeds: one member (or one for each omega) per seed.
       config: the settings.
-      source: folder of the run whose agent is transferred; none for training from scratch.
-      source_member: which member of the source's population.
-      omegas: fractions of equation 19, one target per fraction and seed.
+      sources: folders of the runs whose agents are transferred; none for training from scratch.
+        Fractional transfer takes several: each has targets of its own in one population.
+      source_member: which member of each source's population.
+      omegas: fractions of equation 19, one target per source, fraction and seed.
       baseline: whether agents from scratch, one per seed, join the transfer targets.
       method: "fractional" (section 3.2), "uae" (the universal autoencoder, 3.3.1) or "meta"
         (meta-models on it, 3.3.2); not used from scratch.
@@ -49,7 +50,7 @@ class RunSpec:
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     config: Config
-    source: str | None = None
+    sources: tuple[str, ...] = ()
     source_member: int = 0
     omegas: tuple[float, ...] = ()
     baseline: bool = False
@@ -73,6 +74,9 @@ class RunSpec:
         _require(
             all(0 <= seed < 2**31 for seed in self.seeds),
             f"seeds {self.seeds} must lie in [0, 2^31)",
+        )
+        _require(
+            len(set(self.sources)) == len(self.sources), f"a source is named twice: {self.sources}"
         )
         self._check_method()
         if self.method == "fractional":
@@ -103,7 +107,7 @@ class RunSpec:
             )
 
     def _check_fractional(self) -> None:
-        if self.source is None:
+        if not self.sources:
             _require(not self.omegas, "--omega needs a source agent: add --source DIR")
             return
         _require(self.omegas, "--source needs the fractions to transfer: add --omega 0 0.2")
@@ -115,8 +119,9 @@ class RunSpec:
 
     def _check_on_autoencoder(self) -> None:
         _require(
-            self.source is not None,
-            f"--method {self.method} needs the agent whose autoencoder is used: add --source DIR",
+            len(self.sources) == 1,
+            f"--method {self.method} needs the agent whose autoencoder is used: add --source DIR, "
+            "one only",
         )
         if self.method == "uae":
             return
@@ -159,8 +164,9 @@ class RunSpec:
 
     @property
     def members(self) -> tuple[Member, ...]:
-        """The population: seeds within fractions or numbers of sources, then the baseline."""
-        if self.source is None:
+        """The population: seeds within fractions within sources, or within numbers of stored
+        models; then the baseline."""
+        if not self.sources:
             return tuple(Member(seed, BASELINE) for seed in self.seeds)
         if self.method == "uae":
             return tuple(Member(seed, "uae", {"dynamics": self.dynamics}) for seed in self.seeds)
@@ -171,12 +177,22 @@ class RunSpec:
                 for seed in self.seeds
             )
         targets = tuple(
-            Member(seed, f"omega={omega:g}", {"omega": omega})
+            Member(seed, f"omega={omega:g}{ending}", {"omega": omega} | tags)
+            for ending, tags in self._source_marks()
             for omega in self.omegas
             for seed in self.seeds
         )
         scratch = tuple(Member(seed, BASELINE) for seed in self.seeds)
         return targets + (scratch if self.baseline else ())
+
+    def _source_marks(self) -> list[tuple[str, dict[str, str]]]:
+        """What tells the targets of several sources apart: the end of their labels, and a tag."""
+        if len(self.sources) == 1:
+            return [("", {})]
+        names = [Path(source).name for source in self.sources]
+        if len(set(names)) < len(names):
+            names = list(self.sources)
+        return [(f" from {name}", {"source": name}) for name in names]
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON can hold it."""
@@ -185,6 +201,12 @@ class RunSpec:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "RunSpec":
         """From `to_dict`'s result, by way of JSON too."""
+        known = {field.name for field in dataclasses.fields(cls)}
+        _require(
+            set(values) <= known,
+            f"unknown settings of a run: {', '.join(sorted(set(values) - known))}. Another version "
+            "of this program wrote them: use that one, or train anew in another folder",
+        )
         values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**{**values, "config": configs.from_dict(values["config"])})
 

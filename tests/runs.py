@@ -1,5 +1,8 @@
 """Results folders made in a moment: a run as its spec says, of agents that have not trained."""
 
+import dataclasses
+import json
+
 import jax
 import numpy as np
 
@@ -8,6 +11,7 @@ from dreamer_jax.agent import Batch
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
+from dreamer_jax.schedule import Counters, Schedule
 from experiments.agents import Source, load_source, make_agent, plan
 from experiments.spec import RunSpec
 
@@ -17,9 +21,8 @@ CONFIG = preset("debug")
 def spec_of(*tasks, seeds=(0,), config=CONFIG, **settings) -> RunSpec:
     """A spec for tasks named without their backend."""
     names = tuple(f"bullet/{task}" for task in tasks)
-    settings = {k: str(v) if k == "source" else v for k, v in settings.items()}
-    if "reward_sources" in settings:
-        settings["reward_sources"] = tuple(map(str, settings["reward_sources"]))
+    for name in {"sources", "reward_sources"} & set(settings):
+        settings[name] = tuple(map(str, settings[name]))
     return RunSpec(names, seeds, config, **settings)
 
 
@@ -30,22 +33,57 @@ def random_params(agent, seed=0):
     return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
 
 
-def write_run(directory, spec: RunSpec, seed=0) -> Source:
+def write_run(directory, spec: RunSpec, seed=0, keep=False) -> Source:
     """A results folder of agents with random parameters, after the run's method.
+
+    Args:
+      keep: leave what the folder holds beside the parameters as it is.
 
     Returns:
       Its first agent.
     """
     params = random_params(make_agent(spec), seed)
     if spec.method == "uae":
-        source = load_source(spec.source)
+        source = load_source(spec.sources[0])
         given, claims = transfer.flatten(source.params), transfer.claims(plan(spec), params)
         copied = [path for path, rule in claims.items() if rule.operation == "copy"]
         params = transfer.unflatten(params, {path: given[path] for path in copied})
     params = jax.tree.map(lambda x: np.stack([x] * len(spec.members)), params)
-    Checkpointer(directory / "checkpoints").save(0, {"agent": {"params": params}}, {})
+    checkpoints = Checkpointer(directory / "checkpoints")
+    if keep:
+        step = checkpoints.latest()
+        checkpoints.save(step, {"agent": {"params": params}}, checkpoints.metadata(step))
+        return load_source(directory)
+    checkpoints.save(0, {"agent": {"params": params}}, {})
     write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
     return load_source(directory)
+
+
+def finish(run, root, share=1.0) -> None:
+    """What a planned run leaves behind after a share of its rounds: made-up evaluations, whose
+    returns are the places of the members, and a checkpoint of next to nothing."""
+    folder, spec = root / run.name, run.spec
+    schedule = Schedule(spec.config.schedule, len(spec.tasks))
+    rounds = max(schedule.prefill_rounds, round(share * schedule.rounds))
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json_atomically(folder / "cells.json", list(run.cells))
+    write_json_atomically(folder / "run.json", {"spec": spec.to_dict()})
+    every, steps = spec.config.schedule.evaluate_every, schedule.environment_steps
+    evaluated = {steps(r) // every: steps(r) for r in range(schedule.prefill_rounds, rounds + 1)}
+    rows = [
+        {"kind": "evaluation", "member": member, "env_steps": env_steps, "task": task}
+        | {"return": float(member)}
+        for crossed, env_steps in evaluated.items()
+        if crossed
+        for member in range(len(spec.members))
+        for task in spec.tasks
+    ]
+    lines = "".join(json.dumps(row) + "\n" for row in rows)
+    (folder / "metrics.jsonl").write_text(lines)
+    counters = Counters(rounds, schedule.updates_due(rounds), steps(rounds) // every)
+    Checkpointer(folder / "checkpoints").save(
+        rounds, {"agent": {"params": np.zeros(3)}}, {"counters": dataclasses.asdict(counters)}
+    )
 
 
 def batch_for(agent, *leading, seed=0) -> Batch:

@@ -31,62 +31,10 @@ def run(*arguments, code=0):
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("demo")
-    return directory, run("demo", "--preset", "debug", "--out", directory)
-
-
-@pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     directory = tmp_path_factory.mktemp("whole") / "run"
     run(*TRAIN, "--out", directory)
     return directory
-
-
-def test_the_demo_prints_its_table_report_and_scale(demo):
-    directory, output = demo
-    for label in ("omega=0", "omega=0.2", "omega=0.4", "baseline"):
-        assert any(line.startswith(label) and "±" in line for line in output.splitlines())
-    assert "reward/out/kernel" in output
-    assert "fraction(omega=0..0.4)" in output
-    assert "the machinery, not the effect" in output
-    members = {row["member"] for row in read_metrics(directory / "targets")}
-    assert members == set(range(8))
-
-
-def test_the_demo_writes_pictures_and_videos(demo):
-    directory, output = demo
-    for name in (
-        "curves.png",
-        "curves.svg",
-        "videos/evaluate_bullet_inverted_pendulum.mp4",
-        "videos/prediction_bullet_inverted_pendulum.mp4",
-    ):
-        file = directory / "targets" / name
-        assert file.stat().st_size > 1000
-        assert str(file) in output
-
-
-def test_the_demo_run_again_repeats_nothing(demo):
-    directory, _ = demo
-    before = (directory / "targets" / "metrics.jsonl").read_bytes()
-    output = run("demo", "--preset", "debug", "--out", directory)
-    assert (directory / "targets" / "metrics.jsonl").read_bytes() == before
-    assert "baseline" in output
-
-
-def test_what_was_transferred_is_written_leaf_by_leaf(demo):
-    directory, _ = demo
-    records = json.loads((directory / "targets" / "transfer.json").read_text())
-    by_leaf = {record["leaf"]: record for record in records}
-    assert by_leaf["reward/out/kernel"]["operation"] == "fraction"
-    assert by_leaf["actor/out/kernel"]["operation"] == "keep"
-    assert by_leaf["dynamics/action_in/kernel"]["operation"] == "keep"
-    copied = by_leaf["encoder/conv_0/kernel"]
-    assert copied["norm_after"] == pytest.approx(copied["norm_source"])
-    # omega = 0, 0.2 and 0.4 for two seeds each.
-    expected = [0.0, 0.0, 0.2, 0.2, 0.4, 0.4]
-    assert by_leaf["value/out/bias"]["parameters"]["omega"] == pytest.approx(expected)
 
 
 def test_a_run_killed_at_a_random_moment_and_resumed_is_the_same_to_the_byte(whole, tmp_path):

@@ -45,7 +45,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sources")
     write_run(folder / "uae", spec_of("hopper", "ant"))
     write_run(folder / "other", spec_of("hopper"), seed=9)
-    on = {"source": folder / "uae", "method": "uae"}
+    on = {"sources": [folder / "uae"], "method": "uae"}
     for seed, task in enumerate(("hopper", "walker2d", "ant", "halfcheetah"), start=1):
         write_run(folder / task, spec_of(task, **on), seed)
     for seed, task in enumerate(("hopper", "ant"), start=1):
@@ -60,7 +60,7 @@ def names(folder, *tasks, suffix=""):
 def meta_spec(folder, *tasks, suffix="", **settings):
     return spec_of(
         "inverted_pendulum",
-        source=folder / "uae",
+        sources=(folder / "uae",),
         method="meta",
         reward_sources=names(folder, *tasks, suffix=suffix),
         **settings,
@@ -93,7 +93,7 @@ def usual(agent, name):
 
 
 def test_fractions_of_any_components_last_layer_are_a_setting_of_a_run():
-    spec = spec_of("hopper", source="x", omegas=(0.2,), fractions=("value", "dynamics"))
+    spec = spec_of("hopper", sources=("x",), omegas=(0.2,), fractions=("value", "dynamics"))
     tree = jax.eval_shape(make_agent(spec).init_params, jax.random.key(0))
     claims = transfer.claims(plan(spec), tree)
     mixed = {path for path, rule in claims.items() if rule.operation == "fraction"}
@@ -102,15 +102,62 @@ def test_fractions_of_any_components_last_layer_are_a_setting_of_a_run():
     assert claims["reward/out/kernel"].operation == "keep"
 
 
+@pytest.fixture(scope="module")
+def two_sources(tmp_path_factory):
+    """Agents for other numbers of tasks, and of other action sizes."""
+    folder = tmp_path_factory.mktemp("two")
+    write_run(folder / "first", spec_of("hopper", "ant"), seed=1)
+    write_run(folder / "second", spec_of("halfcheetah"), seed=2)
+    return folder / "first", folder / "second"
+
+
+def test_targets_of_several_sources_are_one_population_each_with_its_own(two_sources):
+    spec = spec_of("hopper", sources=two_sources, omegas=(0.0, 0.5), seeds=(3, 4), baseline=True)
+    labels = [member.label for member in spec.members]
+    assert labels[::2] == [
+        "omega=0 from first", "omega=0.5 from first", "omega=0 from second",
+        "omega=0.5 from second", "baseline",
+    ]  # fmt: skip
+    assert spec.members[4].tags == {"omega": 0.0, "source": "second"}
+    sources = load_sources(spec)
+    params = transferred_members(spec, sources)[0].params
+    fresh = {seed: member(params, 8 + place) for place, seed in enumerate(spec.seeds)}
+    for p, tagged in enumerate(spec.members[:8]):
+        given, target = sources.agents[p // 4].params, member(params, p)
+        assert bits(target["encoder"]) == bits(given["encoder"])
+        assert bits(target["dynamics"]["action_in"]) == bits(
+            fresh[tagged.seed]["dynamics"]["action_in"]
+        )
+        mixed = (
+            fresh[tagged.seed]["value"]["out"]["kernel"]
+            + tagged.tags["omega"] * (given["value"]["out"]["kernel"])
+        )
+        assert_allclose(target["value"]["out"]["kernel"], mixed, rtol=1e-6)
+
+
+def test_sources_whose_shapes_differ_in_what_is_read_are_refused_naming_both(two_sources):
+    spec = spec_of("hopper", sources=two_sources, omegas=(0.2,), fractions=("actor",))
+    with pytest.raises(ValueError, match=r"actor/out/.* in the source .*first and .* in .*second"):
+        transferred_members(spec, load_sources(spec))
+
+
+def test_relative_sources_are_found_from_the_base_folder(two_sources):
+    spec = spec_of("hopper", sources=("first", "second"), omegas=(0.2,))
+    base = two_sources[0].parent
+    assert [source.directory for source in load_sources(spec, base).agents] == list(two_sources)
+
+
 # --- the universal autoencoder ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dynamics", ["fresh", "copied", "frozen"])
 def test_targets_start_from_the_sources_autoencoder(folder, dynamics):
-    spec = spec_of("walker2d", source=folder / "uae", method="uae", dynamics=dynamics, seeds=(3, 4))
+    spec = spec_of(
+        "walker2d", sources=(folder / "uae",), method="uae", dynamics=dynamics, seeds=(3, 4)
+    )
     agent, sources = make_agent(spec), load_sources(spec)
     state, report = transferred_members(spec, sources)
-    given = sources.agent.params
+    given = sources.agents[0].params
     for p in range(2):
         params = member(state.params, p)
         assert bits(params["encoder"]) == bits(given["encoder"])
@@ -331,7 +378,7 @@ def test_a_switching_agent_recognises_the_states_that_it_infers_as_it_runs(switc
 
 
 def test_latent_states_are_samples_along_episodes_or_their_means_or_of_single_images(folder):
-    source = load_sources(spec_of("ant", source=folder / "uae", method="uae")).agent
+    source = load_sources(spec_of("ant", sources=(folder / "uae",), method="uae")).agents[0]
     agent, size = make_agent(source.spec), CONFIG.network.stochastic_size
     batch = batch_for(agent)
     records = Records(*(x[0] for x in batch))._replace(first=np.arange(5) == 0)
@@ -360,18 +407,24 @@ def test_latent_states_are_samples_along_episodes_or_their_means_or_of_single_im
     ("settings", "message"),
     [
         ({"method": "uae"}, "add --source DIR"),
-        ({"method": "uae", "source": "x", "omegas": (0.2,)}, "--omega belongs to --method frac"),
-        ({"method": "uae", "source": "x", "baseline": True}, "--baseline belongs to --method frac"),
-        ({"source": "x", "omegas": (0.2,), "dynamics": "frozen"}, "--dynamics belongs to .*uae or"),
-        ({"source": "x", "omegas": (0.2,), "fractions": ("rewards",)}, "no fraction for 'rewards'"),
-        ({"method": "meta", "source": "x"}, "add --reward-sources DIR DIR"),
-        ({"method": "meta", "source": "x", "reward_sources": ("a", "b"), "reward_counts": (3,)},
+        ({"method": "uae", "sources": ("x",), "omegas": (0.2,)},
+         "--omega belongs to --method frac"),
+        ({"method": "uae", "sources": ("x",), "baseline": True},
+         "--baseline belongs to --method frac"),
+        ({"method": "uae", "sources": ("x", "y")}, "add --source DIR, one only"),
+        ({"sources": ("x", "x"), "omegas": (0.2,)}, "a source is named twice"),
+        ({"sources": ("x",), "omegas": (0.2,), "dynamics": "frozen"},
+         "--dynamics belongs to .*uae or"),
+        ({"sources": ("x",), "omegas": (0.2,), "fractions": ("rewards",)},
+         "no fraction for 'rewards'"),
+        ({"method": "meta", "sources": ("x",)}, "add --reward-sources DIR DIR"),
+        ({"method": "meta", "sources": ("x",), "reward_sources": ("a", "b"), "reward_counts": (3,)},
          r"must lie in \[1, 2\]"),
-        ({"method": "meta", "source": "x", "reward_sources": ("a",), "meta": ("actor",)},
+        ({"method": "meta", "sources": ("x",), "reward_sources": ("a",), "meta": ("actor",)},
          "no meta-model for .'actor'."),
-        ({"method": "meta", "source": "x", "reward_sources": ("a",), "switching": True},
+        ({"method": "meta", "sources": ("x",), "reward_sources": ("a",), "switching": True},
          "add --dynamics frozen"),
-        ({"method": "meta", "source": "x", "reward_sources": ("a",), "threshold": 3.0},
+        ({"method": "meta", "sources": ("x",), "reward_sources": ("a",), "threshold": 3.0},
          "--threshold is that of --switching"),
     ],
 )  # fmt: skip
@@ -394,7 +447,7 @@ def test_sources_of_other_sizes_are_refused_naming_both(folder):
     network = dataclasses.replace(CONFIG.network, head_units=9)
     config = dataclasses.replace(CONFIG, network=network)
     with pytest.raises(ValueError, match="head_units: 8 in the source, 9 here"):
-        load_sources(spec_of("ant", config=config, source=folder / "uae", method="uae"))
+        load_sources(spec_of("ant", config=config, sources=(folder / "uae",), method="uae"))
 
 
 def test_a_meta_model_is_not_stored_in_another(folder, tmp_path):

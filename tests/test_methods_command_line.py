@@ -40,7 +40,7 @@ def runs(source):
     """The folder of two agents on the source's encoder, the first trained, and of a target."""
     runs, on = source.parent, ("--source", source)
     train(runs / TASKS[0], TASKS[0], "--method", "uae", *on)
-    write_run(runs / TASKS[1], spec_of(TASKS[1], method="uae", source=source), seed=1)
+    write_run(runs / TASKS[1], spec_of(TASKS[1], method="uae", sources=[source]), seed=1)
     train(
         runs / "target", TASKS[0], "--method", "meta", *on,
         "--reward-sources", *(runs / task for task in TASKS), "--reward-counts", 1, 2,
@@ -83,7 +83,7 @@ def test_a_meta_run_that_is_resumed_is_the_same_to_the_byte(runs, tmp_path):
     assert checkpoints.latest() < newest
     spec = json.loads((runs / "target" / "run.json").read_text())["spec"]
     train(
-        tmp_path / "target", TASKS[0], "--method", "meta", "--source", spec["source"],
+        tmp_path / "target", TASKS[0], "--method", "meta", "--source", *spec["sources"],
         "--reward-sources", *spec["reward_sources"], "--reward-counts", 1, 2, "--resume",
     )  # fmt: skip
     again, once = (x / "target" / "metrics.jsonl" for x in (tmp_path, runs))
@@ -97,7 +97,7 @@ def test_a_meta_run_is_evaluated_with_its_stored_models(runs, capsys):
 
 def test_a_switching_target_knows_the_tasks_of_its_sources(tmp_path):
     write_run(tmp_path / "source", spec_of(*TASKS))
-    on = {"dynamics": "frozen", "source": tmp_path / "source"}
+    on = {"dynamics": "frozen", "sources": [tmp_path / "source"]}
     for seed, task in enumerate(TASKS, start=1):
         write_run(tmp_path / task, spec_of(task, method="uae", **on), seed)
     stored = [tmp_path / task for task in TASKS]

@@ -1,0 +1,252 @@
+"""Running the graph: in order, once each, going on where one fails; and what it will take."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from runs import CONFIG, finish
+
+from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
+from envs import SimulatorError
+from experiments import estimate
+from experiments.estimate import Speed, plan_table
+from experiments.graph import plan_runs
+from experiments.grid import TABLES, closure, shown
+from experiments.results import folders
+from experiments.sweep import carry_out_runs
+
+TWO_TARGETS = (
+    dataclasses.replace(TABLES["table-3"], counts=(2,), omegas=(0.1, 0.2)),
+    dataclasses.replace(TABLES["table-5"], counts=(2,), omegas=(0.1, 0.2)),
+)
+HOPPER, WALKER = "bullet-Hopper-fractional", "bullet-Walker2D-fractional"
+HOPPERS_SOURCE = "bullet-HalfCheetah+Walker2D-seed-0"
+
+
+def plan(root, *entries, seeds=(0, 1)):
+    cells = [cell for entry in entries or TWO_TARGETS for cell in shown(entry, seeds)]
+    return plan_runs(cells, CONFIG, root)
+
+
+class Trainer:
+    """Finishes runs in a moment and notes their names; those named in `failing` raise."""
+
+    def __init__(self, failing=None, stop_at=None):
+        self.failing, self.stop_at, self.trained = failing or {}, stop_at, []
+
+    def __call__(self, run, root, workers):
+        self.trained.append(run.name)
+        if run.name == self.stop_at:
+            finish(run, root, share=0.5)
+            return "stopped"
+        if run.name in self.failing:
+            finish(run, root, share=0.5)
+            raise self.failing[run.name]
+        finish(run, root)
+        return "finished"
+
+
+def sweep(root, *entries, **behaviour):
+    trainer, said = Trainer(**behaviour), []
+    progress = carry_out_runs(plan(root, *entries), root, train=trainer, say=said.append)
+    return progress, trainer.trained, said
+
+
+def test_every_run_is_trained_once_after_those_it_needs(tmp_path):
+    runs = plan(tmp_path)
+    progress, trained, said = sweep(tmp_path)
+    assert progress.complete
+    assert trained == progress.finished == [run.name for run in runs]
+    assert said[1].startswith("run 2 of 4, bullet-Hopper-fractional: 6 agents on bullet/hopper")
+    cells = {cell.name for entry in TWO_TARGETS for cell in closure(shown(entry, (0, 1)))}
+    assert set(folders(tmp_path)) == cells
+
+
+def test_a_second_sweep_trains_nothing(tmp_path):
+    sweep(tmp_path)
+    progress, trained, _ = sweep(tmp_path)
+    assert progress.complete and trained == []
+
+
+def test_a_sweep_that_is_stopped_goes_on_with_the_run_that_was_cut(tmp_path):
+    progress, trained, _ = sweep(tmp_path, stop_at=HOPPER)
+    assert progress.stopped and not progress.complete
+    assert trained == [HOPPERS_SOURCE, HOPPER]
+    progress, trained, said = sweep(tmp_path)
+    assert progress.complete
+    assert trained[0] == HOPPER and HOPPERS_SOURCE not in trained
+    assert "goes on at 50%" in said[0]
+
+
+def test_a_run_that_fails_is_named_and_what_needs_it_is_skipped_and_the_others_go_on(tmp_path):
+    failing = {HOPPERS_SOURCE: SimulatorError("the contact solver diverged")}
+    progress, trained, _ = sweep(tmp_path, failing=failing)
+    assert "the contact solver diverged" in progress.failed[HOPPERS_SOURCE]
+    assert progress.skipped == {HOPPER: f"it needs {HOPPERS_SOURCE}"}
+    assert WALKER in progress.finished and HOPPER not in trained
+    # What it had is kept, and goes on.
+    progress, trained, _ = sweep(tmp_path)
+    assert progress.complete and trained == [HOPPERS_SOURCE, HOPPER]
+
+
+@pytest.mark.parametrize("error", [CorruptCheckpointError("leaf 3"), ValueError("byte 7")])
+def test_a_run_that_cannot_be_resumed_is_set_aside_and_trained_anew_the_next_time(tmp_path, error):
+    progress, _, _ = sweep(tmp_path, failing={HOPPER: error})
+    assert f"set aside as {HOPPER}.corrupt-1" in progress.failed[HOPPER]
+    assert (tmp_path / f"{HOPPER}.corrupt-1" / "run.json").exists()
+    assert not (tmp_path / HOPPER).exists()
+    progress, trained, _ = sweep(tmp_path)
+    assert progress.complete and trained == [HOPPER]
+
+
+def test_a_damaged_folder_is_set_aside_before_anything_is_trained(tmp_path):
+    finish(plan(tmp_path)[0], tmp_path)
+    (tmp_path / HOPPERS_SOURCE / "run.json").write_text("{")
+    progress, trained, _ = sweep(tmp_path)
+    assert "run.json is not valid JSON" in progress.failed[HOPPERS_SOURCE]
+    assert list(progress.skipped) == [HOPPER] and WALKER in trained
+    assert (tmp_path / f"{HOPPERS_SOURCE}.corrupt-1").is_dir()
+    progress, trained, _ = sweep(tmp_path)
+    assert progress.complete and trained == [HOPPERS_SOURCE, HOPPER]
+
+
+def test_a_source_with_damaged_parameters_is_set_aside_and_not_its_targets(tmp_path):
+    finish(plan(tmp_path)[0], tmp_path)
+    checkpoints = Checkpointer(tmp_path / HOPPERS_SOURCE / "checkpoints")
+    files = [path for path in checkpoints.path(checkpoints.latest()).rglob("*") if path.is_file()]
+    damaged = max(files, key=lambda path: (path.suffix != ".json", path.stat().st_size))
+    data = bytearray(damaged.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged.write_bytes(data)
+    progress, trained, _ = sweep(tmp_path)
+    assert list(progress.failed) == [HOPPERS_SOURCE]
+    assert list(progress.skipped) == [HOPPER] and HOPPER not in trained
+
+
+def test_two_sweeps_at_once_are_refused(tmp_path):
+    def train(run, root, workers):
+        with pytest.raises(ValueError, match="another command is training in .*--results"):
+            sweep(tmp_path)
+        return Trainer()(run, root, workers)
+
+    assert carry_out_runs(plan(tmp_path), tmp_path, train=train, say=lambda _: None).complete
+
+
+# --- what it will take ------------------------------------------------------------------------
+
+SPEED = Speed(
+    update_seconds=0.5,
+    update_bytes=1000,
+    policy_seconds=0.0,
+    tick_seconds=dict.fromkeys(("bullet/hopper", "bullet/walker2d", "bullet/halfcheetah"), 0.01),
+    compile_seconds=0.0,
+    workers=1,
+)
+
+
+def test_an_estimate_is_what_can_be_counted_by_hand(tmp_path):
+    _, targets, *_ = plan(tmp_path)
+    found = estimate.estimate(targets, SPEED)
+    # 4 rounds and 4 evaluations of 20 ticks, and 8 updates, of each of 6 agents.
+    assert found.seconds == pytest.approx(6 * (8 * 0.5 + 8 * 20 * 0.01))
+    # Records of 32 x 32 x 3 bytes, three actions, a reward and two flags: 21 a phase.
+    records = 6 * 4 * 21 * (32 * 32 * 3 + 4 * 3 + 4 + 2)
+    assert records < found.disk < records + 2 * 6 * 10**6
+
+
+def test_time_is_linear_in_each_speed_and_falls_with_what_is_done(tmp_path):
+    _, targets, *_ = plan(tmp_path)
+
+    def seconds(run=targets, **changes):
+        return estimate.estimate(run, dataclasses.replace(SPEED, **changes)).seconds
+
+    ticks = SPEED.tick_seconds
+    doubled = {task: 2 * x for task, x in ticks.items()}
+    slower = seconds(update_seconds=1.0) - seconds()
+    assert slower == pytest.approx(seconds() - seconds(update_seconds=0.0))
+    assert seconds(tick_seconds=doubled) - seconds() == pytest.approx(
+        seconds() - seconds(tick_seconds=dict.fromkeys(ticks, 0.0))
+    )
+    assert seconds(workers=2, update_seconds=0.0) == seconds(update_seconds=0.0) / 2
+    half = dataclasses.replace(targets, state="cut", progress=0.5)
+    assert seconds(half) == pytest.approx(seconds() / 2)
+
+
+def test_time_memory_and_disk_are_linear_in_the_number_of_agents(tmp_path):
+    one, two, three = (
+        estimate.estimate(plan(tmp_path, TWO_TARGETS[0], seeds=range(n))[1], SPEED)
+        for n in (1, 2, 3)
+    )
+    for name in ("seconds", "memory", "disk"):
+        first, second, third = (getattr(x, name) for x in (one, two, three))
+        assert third - second == pytest.approx(second - first)
+        assert second > first
+
+
+def test_memory_of_chunks_is_that_of_one_chunk(tmp_path):
+    _, targets, *_ = plan(tmp_path)
+
+    def memory(**mapping):
+        schedule = dataclasses.replace(CONFIG.schedule, **mapping)
+        spec = dataclasses.replace(
+            targets.spec, config=dataclasses.replace(CONFIG, schedule=schedule)
+        )
+        return estimate.estimate(dataclasses.replace(targets, spec=spec), SPEED).memory
+
+    chunks = [memory(mapping="chunks", mapping_chunk=n) for n in (1, 2, 6, 10)]
+    assert np.diff(chunks).tolist() == [1000, 4000, 0]
+    assert memory(mapping="vmap") == chunks[-1]
+
+
+@pytest.mark.parametrize(("fitting", "chunk"), [(0.5, 1), (3.5, 3), (5.9, 5), (6.1, None)])
+def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for(
+    tmp_path, monkeypatch, fitting, chunk
+):
+    _, targets, *_ = plan(tmp_path)
+    one = SimpleNamespace(temp_size_in_bytes=10**6)
+    beside = estimate.estimate(targets, dataclasses.replace(SPEED, update_bytes=0)).memory
+    limit = (beside + fitting * 10**6) / estimate.MEMORY_SHARE
+    device = SimpleNamespace(memory_stats=lambda: {"bytes_limit": limit})
+    monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device])
+    monkeypatch.setattr(
+        estimate, "_compiled_update", lambda _: [SimpleNamespace(memory_analysis=lambda: one)]
+    )
+    schedule = estimate.in_memory(targets.spec).config.schedule
+    expected = ("auto", 1) if chunk is None else ("chunks", chunk)
+    assert (schedule.mapping, schedule.mapping_chunk) == expected
+
+
+def test_on_a_cpu_agents_are_updated_one_by_one_as_they_are(tmp_path):
+    _, targets, *_ = plan(tmp_path)
+    assert estimate.in_memory(targets.spec) == targets.spec
+
+
+def test_the_plan_names_runs_needs_states_and_totals(tmp_path):
+    source, targets, *_ = plan(tmp_path)
+    finish(source, tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    lines = plan_table(plan(tmp_path), SPEED).splitlines()
+    rows = {line.split()[1]: line.split() for line in lines[2:-1]}
+    assert set(rows) == {run.name for run in plan(tmp_path)}
+    assert rows[HOPPERS_SOURCE][-4:] == ["done", "-", "-", "-"]
+    hopper = rows[HOPPER]
+    assert hopper[2:6] == ["6", "bullet/hopper", rows[HOPPERS_SOURCE][0], "missing"]
+    agents = sum(len(run.cells) for run in plan(tmp_path))
+    assert lines[-1].split()[:2] == ["together", str(agents)]
+
+
+def test_a_plan_of_what_is_done_needs_no_measurement(tmp_path):
+    sweep(tmp_path)
+    assert "done" in plan_table(plan(tmp_path), None)
+
+
+def test_runs_of_every_method_can_be_estimated():
+    hopper = dataclasses.replace(TABLES["table-16"], targets=("Hopper",))
+    runs = plan_runs(shown(hopper), CONFIG, "nowhere")
+    assert {run.spec.method for run in runs} == {"fractional", "uae", "meta"}
+    speed = dataclasses.replace(
+        SPEED, tick_seconds={task: 0.01 for run in runs for task in run.spec.tasks}
+    )
+    assert all(estimate.estimate(run, speed).memory > 0 for run in runs)

@@ -1,0 +1,244 @@
+"""Tables and figures from the command line on real PyBullet tasks, at sizes of seconds."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+from runs import CONFIG, finish, write_run
+
+import envs
+from dreamer_jax.files import read_json
+from dreamer_jax.logs import read_metrics
+from experiments import grid, grid_commands, latent_tables
+from experiments.__main__ import main
+from experiments.graph import plan_runs
+from experiments.grid import TABLES, shown
+from experiments.results import folders, latents_folder, read_classification, read_outcomes
+
+pytest.importorskip("pybullet")
+
+SOURCE = "bullet-HalfCheetah+InvertedDoublePendulum-seed-0"
+TARGETS = "bullet-InvertedPendulum-fractional"
+META = dataclasses.replace(TABLES["table-16"], targets=("InvertedPendulum",), counts=(2,))
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """The folder of results of a demo, and what it printed."""
+    results = tmp_path_factory.mktemp("results")
+    with pytest.MonkeyPatch.context() as patch:
+        lines = []
+        patch.setattr("builtins.print", lambda *words, **_: lines.append(" ".join(map(str, words))))
+        assert main(["demo", "--preset", "debug", "--results", str(results)]) == 0
+    return results, "\n".join(lines)
+
+
+@pytest.fixture(scope="module")
+def root(demo):
+    return demo[0] / "debug"
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """The tables and figures that were to be written, which here is only noted."""
+    entries = []
+    monkeypatch.setattr(grid_commands, "_write", lambda some, *_: entries.extend(some))
+    return entries
+
+
+def metrics(root):
+    return {path.parent.name: path.read_bytes() for path in root.glob("*/metrics.jsonl")}
+
+
+def test_the_demo_prints_its_table_report_and_scale(demo):
+    results, output = demo
+    for label in ("omega=0", "omega=0.2", "omega=0.4", "baseline"):
+        assert any(line.startswith(label) and "±" in line for line in output.splitlines())
+    assert "reward/out/kernel" in output
+    assert "fraction(omega=0..0.4)" in output
+    assert "the machinery, not the effect" in output
+    members = {row["member"] for row in read_metrics(results / "debug" / TARGETS)}
+    assert members == set(range(8))
+
+
+def test_the_demo_writes_pictures_and_videos(demo):
+    results, output = demo
+    for name in (
+        "curves.png",
+        "curves.svg",
+        "videos/evaluate_bullet_inverted_pendulum.mp4",
+        "videos/prediction_bullet_inverted_pendulum.mp4",
+    ):
+        file = results / "debug" / TARGETS / name
+        assert file.stat().st_size > 1000
+        assert str(file) in output
+
+
+def test_the_demo_run_again_repeats_nothing(demo, root, capsys):
+    before = metrics(root)
+    assert main(["demo", "--preset", "debug", "--results", str(demo[0])]) == 0
+    assert metrics(root) == before
+    output = capsys.readouterr().out
+    assert "baseline" in output and "begins" not in output
+
+
+def test_what_was_transferred_is_written_leaf_by_leaf(root):
+    records = json.loads((root / TARGETS / "transfer.json").read_text())
+    by_leaf = {record["leaf"]: record for record in records}
+    assert by_leaf["reward/out/kernel"]["operation"] == "fraction"
+    assert by_leaf["actor/out/kernel"]["operation"] == "keep"
+    assert by_leaf["dynamics/action_in/kernel"]["operation"] == "keep"
+    copied = by_leaf["encoder/conv_0/kernel"]
+    assert copied["norm_after"] == pytest.approx(copied["norm_source"])
+    # omega = 0, 0.2 and 0.4 for two seeds each.
+    expected = [0.0, 0.0, 0.2, 0.2, 0.4, 0.4]
+    assert by_leaf["value/out/bias"]["parameters"]["omega"] == pytest.approx(expected)
+
+
+def test_runs_say_where_their_sources_are_from_the_folder_of_all(root):
+    header = read_json(root / TARGETS / "run.json")
+    assert header["spec"]["sources"] == [SOURCE]
+    assert header["revision"] and header["versions"]["jax"]
+    assert len(read_json(root / TARGETS / "cells.json")) == 8
+
+
+def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(demo, root, written):
+    before = metrics(root)
+    sweep = grid_commands.Sweep("debug", (0, 1), results=demo[0])
+    figure = dataclasses.replace(grid.FIGURES["figure-36"], tasks=("InvertedPendulum",))
+    assert grid_commands._make([grid.DEMO, figure], sweep) == 0
+    assert written == [grid.DEMO, figure]
+    assert metrics(root) == before
+    outcomes = read_outcomes(root, [*shown(grid.DEMO, (0, 1)), *shown(figure, (0, 1))])
+    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+
+
+def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, tmp_path):
+    root = tmp_path / "debug"
+    shutil.copytree(demo[0] / "debug", root)
+    runs = plan_runs(shown(META, (0, 1)), CONFIG, root)
+    *sources, targets = [run for run in runs if run.state == "missing"]
+    # Made in a moment: what is trained here is the population of targets.
+    for seed, run in enumerate(sources):
+        spec = run.spec
+        if spec.sources:
+            spec = dataclasses.replace(spec, sources=tuple(str(root / x) for x in spec.sources))
+        finish(run, root)
+        write_run(root / run.name, spec, seed, keep=True)
+    sweep = grid_commands.Sweep("debug", (0, 1), results=tmp_path)
+    assert grid_commands._make([META], sweep) == 0
+    assert len(targets.cells) == 2
+    outcomes = read_outcomes(root, shown(META, (0, 1)))
+    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {row["label"] for row in read_metrics(root / targets.name)} == {"sources=2"}
+
+
+def test_a_report_of_all_results_is_of_what_there_is_something_of(root, written):
+    before = metrics(root)
+    assert main(["report", str(root), "--seeds", "0", "1"]) == 0
+    # Baselines of InvertedPendulum are beside its targets, meta-models and source agents.
+    assert [entry.name for entry in written] == [
+        *(f"table-{number}" for number in (7, 8, 16, 17)),
+        *(f"figure-{number}" for number in (21, 22, 23, 33, 36, 37, 38, 39)),
+    ]
+    assert metrics(root) == before
+
+
+@pytest.fixture(scope="module")
+def classified(tmp_path_factory):
+    """Results whose universal autoencoder has not trained, and Table 13 made from it."""
+    root = tmp_path_factory.mktemp("latents") / "debug"
+    (cell,) = shown(TABLES["table-13"])
+    (run,) = plan_runs([cell], CONFIG, root)
+    finish(run, root)
+    write_run(root / run.name, run.spec, keep=True)
+    latent_tables.make_table(root, TABLES["table-13"], 0)
+    return root
+
+
+def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatch, written):
+    monkeypatch.setattr(latent_tables, "gather", None)
+    sweep = grid_commands.Sweep("debug", results=classified.parent)
+    entries = [TABLES[f"table-{number}"] for number in (13, 14, 15)]
+    assert grid_commands._make(entries, sweep) == 0
+    for entry in entries:
+        found = read_classification(classified, entry)
+        assert (found.samples, found.feature_size) == (100, 12)
+        assert len(found.shares) == 4 * 6
+        assert (latents_folder(classified, "bullet", 0) / f"{entry.name}.png").exists()
+
+
+def test_shares_are_those_of_the_tables_with_thresholds_scaled_to_the_features(classified):
+    table = TABLES["table-13"]
+    shares = read_classification(classified, table).shares
+    assert [share.task for share in shares[:6]] == [*table.targets, *table.known]
+    assert [share.threshold for share in shares[::6]] == [50, 70, 90, None]
+    assert [share.scaled for share in shares[::6]][:3] == pytest.approx(
+        [xi * 12 / 230 for xi in (50, 70, 90)]
+    )
+    found = read_json(latents_folder(classified, "bullet", 0) / "table-13.json")
+    for share in shares:
+        assert share.known == (share.task in table.known)
+        (name,) = (task for task in found["distances"] if envs.spec(task).title == share.task)
+        near = np.array(found["distances"][name]) <= share.scaled
+        assert share.not_novel == pytest.approx(near.mean())
+        if not share.known:
+            assert share.correct == pytest.approx(1 - near.mean(), abs=1e-6)
+
+
+def test_a_table_of_latent_states_that_is_not_made_is_none(classified):
+    assert read_classification(classified, TABLES["table-13"], seeds=(1,)) is None
+
+
+def test_damaged_samples_are_named_with_the_way_out(classified, tmp_path):
+    shutil.copytree(classified, tmp_path / "debug")
+    folder = latents_folder(tmp_path / "debug", "bullet", 0)
+    (folder / "table-13.json").unlink()
+    (folder / "samples.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"samples.npz is damaged .*: delete it"):
+        latent_tables.make_table(tmp_path / "debug", TABLES["table-13"], 0)
+
+
+def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(demo, capsys):
+    words = ["plan", "--table", "7", "--preset", "debug", "--seeds", "0", "1"]
+    assert main([*words, "--results", str(demo[0])]) == 0
+    output = capsys.readouterr().out
+    assert f"{TARGETS} " in output and f"{TARGETS}-2" in output
+    assert "cut" not in output and "missing" in output and "done" in output
+    assert "An estimate" in output
+    assert set(folders(demo[0] / "debug")) == set(
+        read_json(demo[0] / "debug" / SOURCE / "cells.json")
+        + read_json(demo[0] / "debug" / TARGETS / "cells.json")
+    )
+
+
+def test_results_of_another_preset_are_refused_with_the_difference(demo, tmp_path, capsys):
+    shutil.copytree(demo[0] / "debug", tmp_path / "demo")
+    words = ["table", "7", "--preset", "demo", "--results", str(tmp_path)]
+    assert main(words) == 2
+    assert "learning.batch_size: 2 / 8" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["table", "18"], "unknown table '18': choose from 1 to 17, or all"),
+        (["figure", "9"], "unknown figure '9': choose from 10 to 39, or all"),
+        (["table"], "no table named: choose from 1 to 17"),
+        (["table", "3", "--preset", "thsis"], "Expected one of ('thesis', 'cpu', 'demo', 'debug')"),
+        (["table", "3", "--backend", "mujoco"], "Expected one of ('bullet', 'brax')"),
+        (["table", "3", "--seeds", "1", "1"], "each named once"),
+        (["plan"], "add --table 3"),
+    ],
+)
+def test_bad_input_ends_with_code_2_and_the_choices(arguments, message, tmp_path, capsys):
+    try:
+        code = main([*arguments, "--results", str(tmp_path / "results")])
+    except SystemExit as error:
+        code = error.code
+    assert code == 2
+    captured = capsys.readouterr()
+    assert message in " ".join((captured.out + captured.err).replace("│", " ").split())
+    assert not (tmp_path / "results").exists()
