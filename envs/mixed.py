@@ -51,7 +51,7 @@ class MixedEnv:
             for number, task in enumerate(tasks):
                 self._part_of[task] = index
                 self._numbers[index][task] = number
-        slot, key = jnp.int32(0), jax.random.key(0)
+        slot, key = jnp.int32(0), jnp.zeros(2, jnp.uint32)
         self._layouts = [Layout(jax.eval_shape(part.reset, slot, key)[0]) for part in self.parts]
         self._words = max(layout.size for layout in self._layouts)
         self._reset = mapped_rows(self._reset_rows)
@@ -111,4 +111,4 @@ class MixedEnv:
 
     def _packed(self, index, result) -> tuple[jax.Array, TimeStep]:
         state, time_step = result
-        return self._layouts[index].pack(state, self._words), time_step
+        return self._layouts[index].pack(state, self._words), TimeStep(*time_step)
