@@ -373,10 +373,9 @@ def test_tasks_of_several_kinds_play_as_they_do_alone(slots):
     def phase(env, slots, keys):
         state, start = jax.vmap(env.reset)(slots, keys)
         actions = jnp.full((12, len(slots), 2), 0.25)
-        return jax.tree.map(
-            lambda x, xs: np.concatenate([x[None], xs]),
-            start,
-            jax.lax.scan(jax.vmap(env.step), state, actions)[1],
+        record = jax.lax.scan(jax.vmap(env.step), state, actions)[1]
+        return envs.TimeStep(
+            *(np.concatenate([x[None], xs]) for x, xs in zip(start, record, strict=True))
         )
 
     together = jax.tree.map(np.asarray, phase(mixed, slots, keys))
