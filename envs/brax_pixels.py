@@ -58,6 +58,14 @@ _PHYSICS_STEPS = {
 _SHORT_STEPS = ("spring", "positional")
 
 
+@contextlib.contextmanager
+def _quiet():
+    """Keeps what Brax has to say of its age, and of MuJoCo's, to itself."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 class _Swingup(PipelineEnv):
     """A pendulum on a cart, of one pole or two, that starts hanging and never ends."""
 
@@ -99,8 +107,7 @@ class Physics:
 
     def __init__(self, title: str, backend: str):
         steps = _PHYSICS_STEPS[title][backend in _SHORT_STEPS]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with _quiet():
             if title in _BRAX_NAMES:
                 env = get_environment(_BRAX_NAMES[title], backend=backend, n_frames=steps)
             else:
@@ -112,7 +119,8 @@ class Physics:
 
     def start(self, key: jax.Array) -> Any:
         """The state in which an episode starts."""
-        return self._env.reset(key).pipeline_state
+        with _quiet():
+            return self._env.reset(key).pipeline_state
 
     def step(self, state: Any, action: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
         """Advance by one environment step with `action` (float32 [|A|], clipped to [-1, 1]).
@@ -122,7 +130,8 @@ class Physics:
             has diverged ends it too, without reward, and is replaced by the one before.
         """
         before = State(state, None, jnp.float32(0), jnp.float32(0), {}, {})
-        after = self._env.step(before, jnp.clip(action, -1.0, 1.0))
+        with _quiet():
+            after = self._env.step(before, jnp.clip(action, -1.0, 1.0))
         new, reward = after.pipeline_state, jnp.float32(after.reward)
         finite = jnp.isfinite(jnp.concatenate([new.q, new.qd, reward[None]])).all()
         new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, state)
