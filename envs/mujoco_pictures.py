@@ -11,6 +11,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -56,6 +57,9 @@ except (ModuleNotFoundError, AttributeError) as error:
         "pip install 'dreamer-transfer[brax]'.",
         name=missing,
     ) from error
+
+# Left to itself, MuJoCo writes its warnings to a file in the current folder.
+mujoco.set_mju_user_warning(warnings.warn)
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,7 @@ def model_xml(title: str) -> str:
 def _painted(title: str) -> str:
     """The model in the colours of the PyBullet tasks, under a white sky."""
     root = ElementTree.fromstring(model_xml(title))
+    root.find("compiler").attrib.pop("settotalmass", None)  # deprecated, and of no weight here
     for geom in root.iter("geom"):
         if geom.get("material") == "geom":
             del geom.attrib["material"]
