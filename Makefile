@@ -37,7 +37,7 @@ $(STAMP)%: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 comma := ,
 
-setup: $(STAMP)bullet+gymnasium+dev  ## Set up .venv with everything
+setup: $(STAMP)bullet+brax+gymnasium+dev  ## Set up .venv with everything
 
 demo: $(STAMP)bullet  ## Train a source, transfer it to eight targets, show what came of it (15 minutes)
 	$(RUN) -m experiments demo --results $(RESULTS) $(ARGS)
@@ -57,28 +57,28 @@ figures: $(STAMP)$(BACKEND)  ## Make all figures
 plan: $(STAMP)$(BACKEND)  ## Show the runs behind TABLE and FIGURE (numbers, or all) and what they will take
 	$(RUN) -m experiments plan $(if $(TABLE),--table $(TABLE)) $(if $(FIGURE),--figure $(FIGURE)) $(GRID) $(ARGS)
 
-test: $(STAMP)bullet+gymnasium+dev  ## Run the test suite (10 minutes)
+test: $(STAMP)bullet+brax+gymnasium+dev  ## Run the test suite (10 minutes)
 	$(RUN) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
 
-lint: $(STAMP)bullet+gymnasium+dev  ## Check the style
+lint: $(STAMP)bullet+brax+gymnasium+dev  ## Check the style
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 
-train: $(STAMP)bullet+gymnasium  ## Train on TASK with SEEDS and PRESET into OUT (resumes what is there)
+train: $(STAMP)bullet+brax+gymnasium  ## Train on TASK with SEEDS and PRESET into OUT (resumes what is there)
 	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --out $(OUT) --resume $(ARGS)
 
-sweep: $(STAMP)bullet  ## Transfer SOURCE to TASK: every OMEGA and seed of SEEDS, and a baseline
+sweep: $(STAMP)bullet+brax+gymnasium  ## Transfer SOURCE to TASK: every OMEGA and seed of SEEDS, and a baseline
 	@test -n "$(SOURCE)" || { echo 'error: name the source: make sweep TASK=bullet/hopper SOURCE=runs/source' >&2; exit 2; }
 	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --source $(SOURCE) \
 	  --omega $(OMEGA) --baseline --out $(OUT)-sweep --resume $(ARGS)
 
-evaluate: $(STAMP)bullet+gymnasium  ## Play 5 episodes with every agent in OUT, with videos
+evaluate: $(STAMP)bullet+brax+gymnasium  ## Play 5 episodes with every agent in OUT, with videos
 	$(RUN) -m experiments evaluate $(OUT) --episodes 5 --video $(ARGS)
 
 report: $(STAMP)bullet  ## Print the table of OUT and draw its learning curves
 	$(RUN) -m experiments report $(OUT)
 
-bench: $(STAMP)bullet+gymnasium+dev  ## Run the benchmarks and write runs/benchmarks/table.md (an hour)
+bench: $(STAMP)bullet+brax+gymnasium+dev  ## Run the benchmarks and write runs/benchmarks/table.md (an hour)
 	$(RUN) -m benchmarks runs/benchmarks $(ARGS)
 
 clean:  ## Remove .venv and caches; runs/ and results/ stay

@@ -22,6 +22,7 @@ COMMANDS = {
     "update-bfloat16": "update depth=8 deter=100 stoch=20 units=200 B=16 L=20 precision=bfloat16",
     "population": "population",
     "rollout": "rollout",
+    "rollout-brax": "rollout task=brax/hopper,brax/ant,brax/inverted_pendulum P=1,8",
     "replay": "replay",
     "transfer": "transfer",
     "train": "train",

@@ -3,9 +3,12 @@
     python -m benchmarks.rollout [task=bullet/hopper,bullet/ant] [P=1,3,8] [steps=200]
                                  [image_size=64] [workers=2] [repetitions=3]
 
-Prints one line of JSON. "bridge" is a jitted scan over vmapped steps with random actions, "bare" a
-plain Python loop over as many simulators in as many processes, with no JAX and nobody to wait for:
-what the machine can do at most. Both are the best of the repetitions; "ratio" is their quotient.
+Prints one line of JSON. "bridge" is a jitted scan over vmapped steps with random actions. Beside
+it, for simulators on the host, "bare" is a plain Python loop over as many of them in as many
+processes, with no JAX and nobody to wait for: what the machine can do at most; "ratio" is their
+quotient. For Brax, whose physics is part of the jitted program, "drawing" and "physics" are the
+shares of the time that passes while the processes draw, and otherwise. Rates are the best of the
+repetitions.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from envs.worker import Phase
 from envs.wrappers import ActionRepeat
 
 DEFAULTS = {
-    "task": ",".join(envs.task_names()),
+    "task": ",".join(name for name in envs.task_names() if name.startswith("bullet/")),
     "P": "1,3,8",
     "steps": "200",
     "image_size": "64",
@@ -63,11 +66,21 @@ def bare_rate(task, members: int, steps: int, image_size: int, workers: int) -> 
 
 
 def bridge_rates(task, members: int, steps: int, image_size: int, workers: int, repetitions: int):
-    """Agent steps per second of each repetition, compilation and resets left out."""
+    """Agent steps per second of each repetition, and the share of its time that passed in the
+    simulators' processes; compilation and resets left out."""
     import jax
     import jax.numpy as jnp
 
     env = envs.make([task.name], members, image_size, task.action_repeat, workers)
+    pool_step, waits = env._pool.step, []
+
+    def timed_step(*arguments):
+        start = time.perf_counter()
+        result = pool_step(*arguments)
+        waits.append(time.perf_counter() - start)
+        return result
+
+    env._pool.step = timed_step
     reset = jax.jit(jax.vmap(env.reset))
 
     @jax.jit
@@ -78,12 +91,13 @@ def bridge_rates(task, members: int, steps: int, image_size: int, workers: int, 
     for repetition in range(repetitions + 1):
         state, _ = reset(jnp.arange(members), jax.random.split(jax.random.key(0), members))
         jax.block_until_ready(state)
+        waits.clear()
         start = time.perf_counter()
         jax.block_until_ready(roll(state, jax.random.key(1)))
         seconds = time.perf_counter() - start
         env.check()
         if repetition > 0:
-            yield members * steps / seconds
+            yield members * steps / seconds, sum(waits) / seconds
     env.close()
 
 
@@ -98,20 +112,23 @@ def main(arguments: list[str]) -> None:
     for task in map(envs.spec, settings["task"].split(",")):
         for members in map(int, settings["P"].split(",")):
             workers = min(int(settings["workers"] or available_cores()), members)
-            bare = max(
-                bare_rate(task, members, steps, image_size, workers) for _ in range(repetitions)
+            bridge, waiting = max(
+                bridge_rates(task, members, steps, image_size, workers, repetitions)
             )
-            bridge = max(bridge_rates(task, members, steps, image_size, workers, repetitions))
-            results.append(
-                {
-                    "task": task.name,
-                    "P": members,
-                    "workers": workers,
-                    "bridge": round(bridge, 1),
-                    "bare": round(bare, 1),
-                    "ratio": round(bridge / bare, 3),
-                }
-            )
+            row = {
+                "task": task.name,
+                "P": members,
+                "workers": workers,
+                "bridge": round(bridge, 1),
+            }
+            if task.name.startswith("brax/"):
+                row |= {"drawing": round(waiting, 3), "physics": round(1 - waiting, 3)}
+            else:
+                bare = max(
+                    bare_rate(task, members, steps, image_size, workers) for _ in range(repetitions)
+                )
+                row |= {"bare": round(bare, 1), "ratio": round(bridge / bare, 3)}
+            results.append(row)
     print(
         json.dumps(
             {

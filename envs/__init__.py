@@ -1,7 +1,8 @@
 """Pixel tasks that jitted JAX programs can step: `make`, `task_names`, `spec`, `specs`.
 
-Importing this package also registers the tasks with gymnasium, as `bullet_pixels/Hopper-v0` and so
-on. It imports no JAX by itself, for simulator processes import it too.
+Importing this package also registers the tasks with gymnasium, as `bullet_pixels/Hopper-v0`,
+`brax_pixels/Hopper-v0` and so on. It imports no JAX by itself, for simulator processes import it
+too.
 """
 
 from envs.base import Env, SimulatorError, TaskSpec, TimeStep

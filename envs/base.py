@@ -28,6 +28,7 @@ class TaskSpec:
         time_limit: length of an episode in environment steps (not in actions).
         step_seconds: simulated time of one environment step, in seconds.
         discrete: whether an action is one of |A| choices, given as a one-hot vector.
+        physics: the physics engine, of a backend that has several.
     """
 
     name: str
@@ -39,6 +40,7 @@ class TaskSpec:
     time_limit: int = 1000
     step_seconds: float = 0.0165
     discrete: bool = False
+    physics: str = ""
 
 
 class TimeStep(NamedTuple):

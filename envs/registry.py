@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import pkgutil
 from collections.abc import Sequence
+from dataclasses import replace
 
 import gymnasium
 
@@ -22,6 +23,22 @@ def _bullet(name: str, title: str, action_size: int) -> TaskSpec:
     )
 
 
+# Brax's physics engines, the first the one that its own environments use by default.
+BRAX_ENGINES = ("generalized", "spring", "positional", "mjx")
+
+
+def _brax(name: str, title: str, action_size: int, step_seconds: float) -> TaskSpec:
+    return TaskSpec(
+        name=f"brax/{name}",
+        title=title,
+        action_size=action_size,
+        simulator=f"envs.brax_pixels:simulators.{BRAX_ENGINES[0]}",
+        gymnasium_id=f"brax_pixels/{title}-v0",
+        step_seconds=step_seconds,
+        physics=BRAX_ENGINES[0],
+    )
+
+
 _TASKS = {
     task.name: task
     for task in (
@@ -31,17 +48,29 @@ _TASKS = {
         _bullet("walker2d", "Walker2D", 6),
         _bullet("inverted_pendulum", "InvertedPendulum", 1),
         _bullet("inverted_double_pendulum", "InvertedDoublePendulum", 1),
+        # As near to PyBullet's 16.5 ms as a whole number of Brax's physics steps comes.
+        _brax("ant", "Ant", 8, 0.02),
+        _brax("halfcheetah", "HalfCheetah", 6, 0.02),
+        _brax("hopper", "Hopper", 3, 0.016),
+        _brax("walker2d", "Walker2D", 6, 0.016),
+        _brax("inverted_pendulum", "InvertedPendulum", 1, 0.02),
+        _brax("inverted_double_pendulum", "InvertedDoublePendulum", 1, 0.02),
     )
 }
 
 # The `Env` of each backend, by the first part of a task's name. Named, not imported: JAX stays
 # out of simulator processes, and a backend's packages need not be installed unless it is used.
-_BACKENDS = {"bullet": "envs.bridge:HostEnv", "gymnasium": "envs.bridge:HostEnv"}
+_BACKENDS = {
+    "bullet": "envs.bridge:HostEnv",
+    "brax": "envs.brax_pixels:BraxEnv",
+    "gymnasium": "envs.bridge:HostEnv",
+}
 
 
 def task_names() -> tuple[str, ...]:
     """The names of the tasks of this package, installed or not. Beside them, `gymnasium/ID` is
-    the gymnasium environment of that id."""
+    the gymnasium environment of that id, and `brax/NAME@ENGINE` a Brax task in another of its
+    physics engines."""
     return tuple(_TASKS)
 
 
@@ -58,6 +87,15 @@ def spec(name: str) -> TaskSpec:
     backend, _, id = name.partition("/")
     if backend == "gymnasium" and id:
         return gymnasium_task(id)
+    base, at, engine = name.partition("@")
+    if at and base in _TASKS and backend == "brax":
+        if engine in BRAX_ENGINES:
+            simulator = f"envs.brax_pixels:simulators.{engine}"
+            return replace(_TASKS[base], name=name, simulator=simulator, physics=engine)
+        raise ValueError(
+            f"unknown physics engine {engine!r} in the task {name!r}, expected one of "
+            f"{', '.join(BRAX_ENGINES)}"
+        )
     near = difflib.get_close_matches(name, _TASKS)
     hint = f" Did you mean {' or '.join(near)}?" if near else ""
     raise ValueError(
@@ -98,7 +136,7 @@ def make(
         members: P, at least 1.
         image_size: height and width of the images in pixels.
         action_repeat: environment steps for which an action is held, at least 1.
-        workers: number of simulator processes, by default min(cores, slots).
+        workers: number of simulator processes for each backend, by default min(cores, slots).
         action_size: A, the length of all actions; by default the largest |A| of the tasks.
 
     Raises:
@@ -108,12 +146,8 @@ def make(
     if isinstance(tasks, str):
         raise ValueError(f"got the string {tasks!r}, expected a list of tasks such as [{tasks!r}]")
     known = specs(tasks)
-    makers = {_BACKENDS[name.partition("/")[0]] for name in tasks}
-    if len(makers) != 1:
-        raise ValueError(
-            f"got tasks {list(tasks)}, expected at least one task, and all of backends that run "
-            "together"
-        )
+    if not known:
+        raise ValueError("got no tasks, expected at least one task")
     numbers = dict(members=members, image_size=image_size, action_repeat=action_repeat)
     if workers is not None:
         numbers["workers"] = workers
@@ -126,10 +160,22 @@ def make(
             f"got action_size={action_size}, but of the tasks {list(tasks)} the largest needs "
             f"{largest}"
         )
-    make_env = pkgutil.resolve_name(makers.pop())
-    return make_env(
-        known, members, image_size, action_repeat, action_size or largest, workers=workers
-    )
+    makers = [_BACKENDS[name.partition("/")[0]] for name in tasks]
+    places = {maker: [k for k, other in enumerate(makers) if other == maker] for maker in makers}
+    parts = []
+    try:
+        for maker, chosen in places.items():
+            make_env = pkgutil.resolve_name(maker)
+            part = [known[k] for k in chosen]
+            size = action_size or largest
+            parts.append(make_env(part, members, image_size, action_repeat, size, workers=workers))
+    except BaseException:
+        for part in parts:
+            part.close()
+        raise
+    if len(parts) == 1:
+        return parts[0]
+    return pkgutil.resolve_name("envs.mixed:MixedEnv")(parts, list(places.values()), members)
 
 
 def register_gymnasium() -> None:

@@ -25,7 +25,8 @@ from experiments.spec import RunSpec, read_spec
 
 
 def _versions() -> dict[str, str]:
-    names = ("jax", "jaxlib", "flax", "optax", "numpy", "gymnasium", "pybullet", "pygame", "pillow")
+    names = ("jax", "jaxlib", "flax", "optax", "numpy", "pillow")
+    names += ("gymnasium", "pygame", "pybullet", "brax", "mujoco")
     versions = {"python": platform.python_version(), "backend": jax.default_backend()}
     for name in names:
         try:

@@ -15,7 +15,7 @@ from envs.base import Outcome
 from envs.pool import SimulatorPool
 from envs.wrappers import ActionPadding, ActionRepeat, TimeLimit
 
-NAMES = envs.task_names()
+NAMES = [name for name in envs.task_names() if name.startswith("bullet/")]
 LOCOMOTION = [name for name in NAMES if "pendulum" not in name]
 
 

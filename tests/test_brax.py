@@ -1,0 +1,483 @@
+"""The six Brax tasks: Brax's physics and rewards, swing-ups, pictures, reproducible to the bit.
+
+P member, K task, T ticks. Physics is compiled here for the pendula and the Hopper; of the other
+tasks only models and pictures are looked at.
+"""
+
+import hashlib
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from typing import NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from probes import Probe
+
+import envs
+from envs import SimulatorError, TaskSpec
+from envs.bridge import HostEnv
+from envs.mixed import MixedEnv
+
+NAMES = [name for name in envs.task_names() if name.startswith("brax/")]
+TITLES = [envs.spec(name).title for name in NAMES]
+SWINGUP = "brax/inverted_pendulum"
+
+
+@pytest.fixture(scope="module")
+def brax_pixels():
+    """The module, where Brax is installed and something can draw."""
+    module = pytest.importorskip("envs.brax_pixels", reason="brax is not installed")
+    try:
+        module.pictures("InvertedPendulum", 8)
+    except SimulatorError as error:
+        pytest.skip(str(error))
+    return module
+
+
+@pytest.fixture(scope="module")
+def env(brax_pixels):
+    """P = 2 members of the swing-up, in one process that draws."""
+    made = envs.make([SWINGUP], members=2, image_size=16, workers=1)
+    yield made
+    made.close()
+
+
+def phase_of(env, tasks, ticks):
+    """A jitted phase of random actions by all P * K slots: first time steps, then T of them."""
+
+    @jax.jit
+    def phase(key):
+        slots = jnp.arange(env.members * tasks).reshape(env.members, tasks)
+        keys = jax.random.split(key, slots.shape)
+        state, start = jax.vmap(jax.vmap(env.reset))(slots, keys)
+        shape = (ticks, env.members, tasks, env.action_size)
+        actions = jax.random.uniform(key, shape, minval=-1, maxval=1)
+        return start, jax.lax.scan(jax.vmap(jax.vmap(env.step)), state, actions)[1]
+
+    def run(seed):
+        result = jax.tree.map(np.asarray, phase(jax.random.key(seed)))
+        env.check()
+        return result
+
+    return run
+
+
+def same(one, two) -> bool:
+    return jax.tree.all(jax.tree.map(np.array_equal, one, two))
+
+
+# Names
+
+
+def test_six_tasks_have_the_sizes_of_pybullets():
+    assert [name.replace("brax", "bullet") for name in NAMES] == [
+        name for name in envs.task_names() if name.startswith("bullet/")
+    ]
+    for name in NAMES:
+        other = envs.spec(name.replace("brax", "bullet"))
+        assert envs.spec(name).action_size == other.action_size
+        assert envs.spec(name).time_limit == other.time_limit
+
+
+def test_the_physics_engine_is_part_of_the_name():
+    task = envs.spec("brax/hopper@spring")
+    assert (task.physics, task.title) == ("spring", "Hopper")
+    assert envs.spec("brax/hopper").physics == "generalized"
+    with pytest.raises(ValueError, match="unknown physics engine 'sprng'.*generalized, spring"):
+        envs.spec("brax/hopper@sprng")
+    with pytest.raises(ValueError, match="unknown task 'bullet/hopper@spring'"):
+        envs.spec("bullet/hopper@spring")
+
+
+def test_without_brax_making_a_task_says_what_to_install(tmp_path):
+    missing = "raise ModuleNotFoundError(\"No module named 'mujoco'\", name='mujoco')"
+    (tmp_path / "mujoco.py").write_text(missing)
+    code = (
+        f"import sys; sys.path[:0] = [{str(tmp_path)!r}, '.']\n"
+        "import envs; assert 'brax/ant' in envs.task_names()\n"
+        "try: envs.make(['brax/ant'])\n"
+        "except ModuleNotFoundError as error: print(error)"
+    )
+    environment = os.environ | {"MUJOCO_GL": "egl"}
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert "pip install 'dreamer-transfer[brax]'" in said.stdout, said.stderr
+
+
+def test_where_nothing_draws_the_error_names_the_packages():
+    # Not imported here: MuJoCo reads MUJOCO_GL once, and other tests draw.
+    if not all(map(importlib.util.find_spec, ("brax", "mujoco"))):
+        pytest.skip("brax is not installed")
+    # A platform on which OpenGL is not found, as on a machine without EGL.
+    environment = os.environ | {"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "osmesa"}
+    code = "from envs.mujoco_pictures import Pictures; Pictures('Hopper', 8)"
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert said.returncode != 0
+    assert "apt-get install libegl1" in said.stderr and "libosmesa6" in said.stderr
+
+
+def test_importing_brax_says_nothing(brax_pixels):
+    code = "import envs.brax_pixels as module; module.physics_of('Hopper', 'generalized')"
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ
+    )
+    assert (said.returncode, said.stdout, said.stderr) == (0, "", "")
+
+
+# Physics
+
+
+@pytest.mark.parametrize("title, name", list(zip(TITLES, NAMES, strict=True)))
+def test_an_agent_step_is_about_as_long_as_pybullets(brax_pixels, title, name):
+    physics = brax_pixels.physics_of(title, "generalized")
+    task = envs.spec(name)
+    assert physics.seconds == pytest.approx(task.step_seconds)
+    assert physics.action_size == task.action_size
+    bullet = envs.spec(name.replace("brax", "bullet"))
+    assert 0.9 <= task.step_seconds / bullet.step_seconds <= 1.25
+
+
+def test_the_hopper_is_brax_own(brax_pixels):
+    """The same states, rewards and falls as Brax's environment with actions held as long."""
+    from brax.envs import get_environment
+
+    own = get_environment("hopper", backend="generalized", n_frames=8)
+    physics = brax_pixels.physics_of("Hopper", "generalized")
+    actions = jax.random.uniform(jax.random.key(1), (30, 3), minval=-1, maxval=1)
+
+    @jax.jit
+    def both(key):
+        def tick(states, action):
+            mine, brax = states
+            mine, reward, terminal = physics.step(mine, action)
+            brax = own.step(brax, action)
+            return (mine, brax), (
+                reward - brax.reward,
+                terminal - brax.done,
+                mine.q - brax.pipeline_state.q,
+                terminal,
+            )
+
+        return jax.lax.scan(tick, (physics.start(key), own.reset(key)), actions)[1]
+
+    reward, done, positions, terminal = both(jax.random.key(0))
+    assert terminal.any() and not terminal.all()
+    for difference in (reward, done, positions):
+        np.testing.assert_array_equal(difference, 0.0)
+
+
+@pytest.mark.parametrize("title", ["InvertedPendulum", "InvertedDoublePendulum"])
+def test_pendula_start_hanging_and_are_paid_the_cosines(brax_pixels, title):
+    physics = brax_pixels.physics_of(title, "generalized")
+    keys = jax.random.split(jax.random.key(0), 200)
+    starts = jax.jit(jax.vmap(physics.start))(keys).q
+    offsets = np.asarray(starts - jnp.array([0, np.pi, 0])[: physics.positions])
+    assert not offsets[:, 0].any() and np.abs(offsets).max() <= 0.1
+    # The mean and deviation of U(-0.1, 0.1), within four standard errors.
+    np.testing.assert_allclose(offsets[:, 1:].mean(0), 0.0, atol=4 * 0.1 / np.sqrt(3 * 200))
+    np.testing.assert_allclose(offsets[:, 1:].std(0), 0.1 / np.sqrt(3), rtol=0.15)
+
+    hinges = jnp.array([[0.0, 0.0], [np.pi, 0.0], [np.pi, np.pi], [np.pi / 2, 0.0]])
+
+    @jax.jit
+    @jax.vmap
+    def pushed(hinges):
+        positions = jnp.array([0.0, *hinges])[: physics.positions]
+        state = physics._env.pipeline_init(positions, jnp.zeros_like(positions))
+
+        def step(state, action):
+            state, reward, terminal = physics.step(state, action)
+            return state, (state.q[1:], reward, terminal)
+
+        actions = jnp.concatenate([jnp.zeros((1, 1)), jnp.ones((60, 1))])
+        return positions[1:], *jax.lax.scan(step, state, actions)[1]
+
+    start, angles, rewards, terminal = map(np.asarray, pushed(hinges))
+    np.testing.assert_allclose(rewards, np.cos(angles).sum(-1), atol=1e-5)
+    np.testing.assert_allclose(rewards[:, 0], np.cos(start).sum(-1), atol=0.05)
+    assert not terminal.any()
+    assert np.abs(angles[1] - np.pi).max() > 1.6, "the hinge has no stops"
+
+
+def test_a_state_that_is_not_finite_ends_the_episode_before_it(brax_pixels):
+    physics = brax_pixels.physics_of("InvertedPendulum", "generalized")
+
+    @jax.jit
+    def after_infinity(key):
+        state = physics.start(key)
+        after = physics.step(state.replace(qd=state.qd.at[0].set(jnp.inf)), jnp.ones(1))
+        return state.q, after[0].q, *after[1:]
+
+    before, after, reward, terminal = after_infinity(jax.random.key(0))
+    assert terminal and reward == 0
+    np.testing.assert_array_equal(after, before)
+
+
+# The environment
+
+
+def test_a_phase_hangs_at_first_and_repeats_to_the_bit_after_others(env):
+    phase = phase_of(env, tasks=1, ticks=30)
+    start, record = phase(0)
+    assert start.first.all() and not start.reward.any()
+    assert not record.first.any() and not record.terminal.any()
+    assert (record.reward[:2] < -1.97).all(), "hanging, two environment steps a tick"
+    assert (record.reward[:, 0] != record.reward[:, 1]).any(), "members have keys of their own"
+    others = phase(1)
+    assert not same(others, (start, record))
+    assert same(phase(0), (start, record))
+
+
+FRESH_PROCESS = """
+import hashlib, sys, jax, envs
+from test_brax import SWINGUP, phase_of
+env = envs.make([SWINGUP], members=2, image_size=16, workers=2)
+leaves = jax.tree.leaves(phase_of(env, tasks=1, ticks=30)(0))
+print(hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest())
+env.close()
+"""
+
+
+def test_a_phase_is_the_same_in_a_fresh_process(env):
+    leaves = jax.tree.leaves(phase_of(env, tasks=1, ticks=30)(0))
+    paths = os.pathsep.join(map(os.path.abspath, filter(None, sys.path)))
+    fresh = subprocess.run(
+        [sys.executable, "-c", FRESH_PROCESS],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths},
+    )
+    expected = hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest()
+    assert fresh.stdout.strip() == expected, fresh.stderr
+
+
+@pytest.fixture
+def counting(brax_pixels, monkeypatch):
+    """Environments of physics known by hand: an episode of task "Ant" ends with its 3rd step, of
+    any other with its 5th; the reward is the first action, the hinge shows the step's number."""
+
+    class State(NamedTuple):
+        q: jax.Array
+        steps: jax.Array
+
+    class Counting(brax_pixels.Physics):
+        action_size, positions = 1, 2
+
+        def __init__(self, title, backend):
+            self.end = 3 if title == "Ant" else 5
+
+        def start(self, key):
+            return State(jax.random.uniform(key, (2,)), jnp.int32(0))
+
+        def step(self, state, action):
+            steps = state.steps + 1
+            return State(jnp.array([0.0, 1.0]) * steps, steps), action[0], steps == self.end
+
+    monkeypatch.setattr(brax_pixels, "physics_of", Counting)
+    pendulum = replace(envs.spec(SWINGUP), simulator="envs.mujoco_pictures:Drawing")
+    monkeypatch.setattr(brax_pixels, "_drawing", lambda task: replace(pendulum, action_size=2))
+    made = []
+
+    def make(*names, members=1, repeat=1):
+        tasks = [envs.spec(name) for name in names]
+        made.append(brax_pixels.BraxEnv(tasks, members, 8, repeat, 2, workers=1))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_the_action_is_held_up_to_a_fall_and_the_next_tick_resets(counting):
+    env = counting("brax/ant", repeat=2)
+    state, _ = env.reset(jnp.int32(0), jax.random.key(0))
+    actions = jnp.array([[1.0, 9], [0.5, 9], [7.0, 9], [-2.0, 9]])
+    state, record = jax.jit(lambda state: jax.lax.scan(env.step, state, actions))(state)
+    env.check()
+    assert record.reward.tolist() == [2.0, 0.5, 0.0, -4.0]
+    assert record.terminal.tolist() == [False, True, False, False]
+    assert record.first.tolist() == [False, False, True, False]
+    assert (state.episode, state.ended) == (1, 0)
+
+
+@pytest.mark.parametrize("slots", [[2, 1, 3, 0], [1, 2]], ids=str)
+def test_each_slot_plays_its_own_task_in_any_order_and_number(counting, slots):
+    env = counting("brax/ant", "brax/hopper", members=2)
+    slots = jnp.array(slots)
+
+    @jax.jit
+    def phase(keys):
+        state, _ = jax.vmap(env.reset)(slots, keys)
+        actions = jnp.broadcast_to(slots[:, None] + 1.0, (6, len(slots), 2))
+        return jax.lax.scan(jax.vmap(env.step), state, actions)[1]
+
+    record = phase(jax.random.split(jax.random.key(0), len(slots)))
+    env.check()
+    for column, slot in enumerate(slots.tolist()):
+        ends = 3 if slot % 2 == 0 else 5
+        assert np.argmax(record.terminal[:, column]) == ends - 1
+        assert np.argmax(record.first[:, column]) == ends
+        np.testing.assert_array_equal(record.reward[:ends, column], slot + 1.0)
+
+
+def test_slots_that_are_alike_or_missing_are_refused(env):
+    keys = jax.random.split(jax.random.key(0), 2)
+    for slots, message in [([1, 1], "some are alike"), ([0, 2], "expected 0 to 1")]:
+        jax.vmap(env.reset)(jnp.array(slots), keys)
+        with pytest.raises(SimulatorError, match=message):
+            env.check()
+
+
+def test_an_action_that_is_not_finite_is_an_error_naming_slot_and_task(counting):
+    env = counting("brax/ant")
+    state, _ = env.reset(jnp.int32(0), jax.random.key(0))
+    env.step(state, jnp.array([jnp.nan, 0.0]))
+    with pytest.raises(SimulatorError, match=r"slot 0 \(brax/ant\) got an action that is not fin"):
+        env.check()
+
+
+def test_a_dead_renderer_is_reported_and_does_not_hang(counting):
+    env = counting("brax/ant", members=2)
+    process = env._pool._workers[0].process
+    process.kill()
+    process.wait()
+    jax.vmap(env.reset)(jnp.arange(2), jax.random.split(jax.random.key(0), 2))
+    with pytest.raises(SimulatorError, match=f"{process.pid} .*signal {signal.SIGKILL:d}"):
+        env.check()
+
+
+# Beside other simulators
+
+
+@pytest.mark.parametrize("slots", [[5, 0, 4, 1, 3, 2], [4, 2, 3]], ids=str)
+def test_tasks_of_several_kinds_play_as_they_do_alone(slots):
+    """K = 3 tasks by P = 2 members: a probe, a simulator on the host, and another probe."""
+    fake = TaskSpec("fake/falling", "Falling", 2, "fake_simulators:Falling", "")
+    probes, host = Probe(2, 4), HostEnv([fake], 2, 4, 1, 2, workers=1)
+    mixed = MixedEnv([probes, host], [[0, 2], [1]], members=2)
+    slots = jnp.array(slots)
+    keys = jax.vmap(lambda slot: jax.random.key_data(jax.random.key(slot)))(slots)
+
+    def phase(env, slots, keys):
+        state, start = jax.vmap(env.reset)(slots, keys)
+        actions = jnp.full((12, len(slots), 2), 0.25)
+        record = jax.lax.scan(jax.vmap(env.step), state, actions)[1]
+        return envs.TimeStep(
+            *(np.concatenate([x[None], xs]) for x, xs in zip(start, record, strict=True))
+        )
+
+    together = jax.tree.map(np.asarray, phase(mixed, slots, keys))
+    mixed.check()
+    for column, slot in enumerate(slots.tolist()):
+        env = host if slot % 3 == 1 else probes
+        alone = phase(env, jnp.array([slot // 3]), keys[column : column + 1])
+        assert same(jax.tree.map(lambda x, c=column: x[:, c], together), _first(alone))
+    host.check()
+    host.close()
+
+
+def _first(record):
+    return jax.tree.map(lambda x: np.asarray(x)[:, 0], record)
+
+
+def test_an_error_of_one_kind_is_raised_by_check():
+    class Broken(Probe):
+        def check(self):
+            raise SimulatorError("broken")
+
+    mixed = MixedEnv([Probe(2, 4), Broken(2, 4)], [[0], [1]], members=1)
+    with pytest.raises(SimulatorError, match="broken"):
+        mixed.check()
+
+
+# Pictures
+
+
+def silhouette(image) -> np.ndarray:
+    """Left, right, top and bottom of what is not white, as shares of the picture's size."""
+    drawn = (image < 200).any(-1)
+    rows, columns = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
+    return np.array([columns[0], columns[-1], rows[0], rows[-1]]) / len(image)
+
+
+@pytest.mark.parametrize("title", TITLES)
+def test_pictures_are_drawn_as_the_joints_say_before_a_white_sky(brax_pixels, title):
+    pictures = brax_pixels.pictures(title, 64)
+    rest = pictures.draw(pictures.positions)
+    assert rest.shape == (64, 64, 3) and rest.dtype == np.uint8
+    assert (rest[0, 0] == 255).all() and (rest[0, -1] == 255).all()
+    bent = pictures.positions + 0.3 * (np.arange(len(pictures.positions)) >= 3)
+    bent[1] += 0.3 * ("Pendulum" in title)
+    assert (pictures.draw(bent) != rest).any()
+    assert (pictures.draw(pictures.positions) == rest).all(), "whatever was drawn before"
+
+
+@pytest.mark.parametrize("title", ["Hopper", "Walker2D", "InvertedPendulum"])
+def test_the_camera_follows_a_walker_and_stays_with_a_pendulum(brax_pixels, title):
+    pictures = brax_pixels.pictures(title, 64)
+    away = pictures.positions.copy()
+    away[0] = 0.5
+    moved = silhouette(pictures.draw(away)) - silhouette(pictures.draw(pictures.positions))
+    if "Pendulum" in title:
+        assert moved[0] == 0 and np.abs(moved).max() <= 2 / 64, "the rail stays where it is"
+        # A row of pixels just above the rail.
+        cart = np.flatnonzero((pictures.draw(away)[30] < 200).any(-1)).mean()
+        # Half a metre at a distance of 2 m, where the picture is 2.31 m wide.
+        assert cart / 64 == pytest.approx(0.5 + 0.5 / 2.31, abs=0.06)
+    else:
+        assert np.abs(moved).max() <= 1 / 64
+
+
+@pytest.mark.parametrize("title", ["Hopper", "Walker2D", "InvertedPendulum"])
+def test_bodies_are_where_pybullet_shows_them(brax_pixels, title):
+    bullet = pytest.importorskip("envs.bullet").BulletSimulator(title, 64)
+    bullet.reset(0)
+    pictures = brax_pixels.pictures(title, 64)
+    positions = pictures.positions.copy()
+    positions[1] += np.pi * (title == "InvertedPendulum")
+    brax = silhouette(pictures.draw(positions))
+    np.testing.assert_allclose(brax, silhouette(bullet.render()), atol=4 / 64)
+    bullet.close()
+
+
+# Gymnasium
+
+
+@pytest.mark.parametrize("title", TITLES)
+def test_gymnasium_ids_have_the_spaces_of_the_task(brax_pixels, title):
+    with gymnasium.make(f"brax_pixels/{title}-v0", image_size=32) as env:
+        size = brax_pixels.physics_of(title, "generalized").action_size
+        assert env.observation_space == gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8)
+        assert env.action_space == gymnasium.spaces.Box(-1, 1, (size,), np.float32)
+
+
+def test_gymnasiums_checker_has_nothing_to_say_and_seeds_repeat(brax_pixels):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make("brax_pixels/InvertedPendulum-v0", image_size=32)
+        check_env(env.unwrapped, skip_render_check=True)
+
+    def episode(seed):
+        images, rewards = [env.reset(seed=seed)[0]], []
+        for step in range(10):
+            image, reward, *_ = env.step(np.float32([(-1) ** step]))
+            images.append(image)
+            rewards.append(reward)
+        return np.array(images), np.array(rewards)
+
+    first = episode(0)
+    assert not same(episode(1), first)
+    assert same(episode(0), first)
+    env.close()
