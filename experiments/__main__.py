@@ -1,12 +1,13 @@
 """The command line: python -m experiments {train, evaluate, table, plan, ...}; --help names all."""
 
 import functools
+import inspect
 import operator
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import tyro
@@ -68,7 +69,8 @@ def _keep_compiled_functions() -> None:
 
 def _parse(arguments: list[str]):
     """Parses in two steps: the preset first, since it sets the defaults of all other settings."""
-    if arguments[:1] != ["train"]:
+    defaults = _with_settings(_preset_in(arguments))
+    if not arguments or arguments[0] not in defaults:
         choices = [
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in COMMANDS.items()
@@ -76,21 +78,41 @@ def _parse(arguments: list[str]):
         return tyro.cli(
             functools.reduce(operator.or_, choices), args=arguments, prog="python -m experiments"
         )
-    Train = commands.Train
-    name = Train.preset
+    name, options = arguments[0], COMMANDS[arguments[0]][0]
+    return tyro.cli(
+        options,
+        default=defaults[name],
+        args=arguments[1:],
+        prog=f"python -m experiments {name}",
+        description=inspect.getdoc(options),
+    )
+
+
+def _preset_in(arguments: list[str]) -> str:
+    """The preset that the arguments name, or the default one."""
+    name = commands.Train.preset
     for i, argument in enumerate(arguments):
         if argument == "--preset" and i + 1 < len(arguments):
             name = arguments[i + 1]
         elif argument.startswith("--preset="):
             name = argument.partition("=")[2]
-    default = Train(task=tyro.MISSING, out=tyro.MISSING, preset=name, config=configs.preset(name))
-    return tyro.cli(
-        Train,
-        default=default,
-        args=arguments[1:],
-        prog="python -m experiments train",
-        description=Train.__doc__,
-    )
+    return name
+
+
+def _with_settings(preset: str) -> dict[str, Any]:
+    """Defaults of the commands whose settings are a preset's, each to be overridden by name.
+
+    Raises:
+      ValueError: there is no such preset.
+    """
+    config, missing = configs.preset(preset), tyro.MISSING
+    sweep = grid_commands.Sweep(preset=preset, config=config)
+    return {
+        "train": commands.Train(task=missing, out=missing, preset=preset, config=config),
+        "table": grid_commands.Tables(names=missing, sweep=sweep),
+        "figure": grid_commands.Figures(names=missing, sweep=sweep),
+        "plan": grid_commands.Plan(sweep=sweep),
+    }
 
 
 if __name__ == "__main__":

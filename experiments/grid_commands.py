@@ -3,6 +3,7 @@
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,15 +25,21 @@ class Sweep:
     """What all runs of a sweep share."""
 
     preset: Preset = "cpu"
-    """Settings of all agents; their results are in a folder of that name."""
+    """Settings of all agents, each of which can be overridden by its name below; results are in a
+    folder of that name."""
     seeds: tuple[int, ...] = grid.SEEDS
     """Seeds of targets and baselines; source agents have the first of them."""
     backend: Backend = "bullet"
     """The simulators."""
+    omegas: tuple[float, ...] = grid.OMEGAS
+    """Train targets of these fractions only; what is left out is shown as not run."""
+    counts: tuple[int, ...] = grid.COUNTS
+    """Train targets of these numbers of source tasks only."""
     results: Path = Path("results")
     """The folder of all results."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
+    config: tyro.conf.OmitArgPrefixes[configs.Config] = configs.preset("cpu")
 
     @property
     def root(self) -> Path:
@@ -127,6 +134,13 @@ def figures(command: Figures) -> int:
     return _make(entries, command.sweep)
 
 
+def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
+    """A table or figure of the fractions and numbers of source tasks that are asked for."""
+    omegas = tuple(omega for omega in entry.omegas if omega in sweep.omegas)
+    counts = tuple(count for count in entry.counts if count in sweep.counts)
+    return dataclasses.replace(entry, omegas=omegas, counts=counts)
+
+
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
     """The runs behind tables and figures."""
     from experiments.graph import plan_runs
@@ -134,8 +148,15 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
     with usage_errors():
         if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
             raise ValueError(f"seeds {sweep.seeds} must be one or more, each named once")
+        for name, wanted, there in (
+            ("omegas", sweep.omegas, grid.OMEGAS),
+            ("counts", sweep.counts, grid.COUNTS),
+        ):
+            if not wanted or not set(wanted) <= set(there):
+                raise ValueError(f"{name} {wanted} must be one or more of {there}")
+        entries = [_restricted(entry, sweep) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
-        return plan_runs(cells, configs.preset(sweep.preset), sweep.root)
+        return plan_runs(cells, sweep.config, sweep.root)
 
 
 def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
@@ -259,7 +280,13 @@ def demo(command: Demo) -> int:
     from experiments import evaluate, report
     from experiments.results import folders
 
-    sweep = Sweep(command.preset, (0, 1), results=command.results, workers=command.workers)
+    sweep = Sweep(
+        command.preset,
+        (0, 1),
+        results=command.results,
+        workers=command.workers,
+        config=configs.preset(command.preset),
+    )
     _, progress = _carry_out([grid.DEMO], sweep)
     if not progress.complete:
         return STOPPED if progress.stopped else _tell_problems(progress)
