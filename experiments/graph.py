@@ -78,6 +78,31 @@ def config_of(cell: Cell, config: Config) -> Config:
     )
 
 
+def changed_settings(root: str | Path) -> tuple[str, ...]:
+    """Settings of the runs under a root that are not those of the preset it is named after.
+
+    Such as "environment_steps 30000", which stands for agents for one task.
+    """
+    root, found = Path(root), {}
+    if root.name not in configs.PRESETS:
+        return ()
+    for folder in run_folders(root):
+        try:
+            spec = read_spec(folder)
+        except (ValueError, KeyError, TypeError):
+            continue  # `read_outcomes` warns of it
+        config = spec.config
+        if len(spec.tasks) > 1:
+            steps = config.schedule.environment_steps // MULTITASK_STEPS
+            schedule = dataclasses.replace(config.schedule, environment_steps=steps)
+            config = dataclasses.replace(config, schedule=schedule)
+        for text in configs.differences(config, configs.preset(root.name)):
+            if not text.startswith(_OF_THE_MACHINE):
+                name, _, value = text.partition(" / ")[0].partition(": ")
+                found[f"{name.partition('.')[2]} {value}"] = None
+    return tuple(found)
+
+
 def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[PlannedRun, ...]:
     """The runs behind cells, each after those that it needs, and those that were cut first.
 

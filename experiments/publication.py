@@ -13,6 +13,7 @@ from pathlib import Path
 
 from experiments import comparison, figures, grid, published, results, statistics
 from experiments.comparison import Entry
+from experiments.graph import changed_settings
 from experiments.grid import Cell, Figure, Table
 from experiments.report import aligned
 from experiments.results import Outcome
@@ -121,8 +122,11 @@ def read_sheet(table: Table, root: Path, seeds: tuple[int, ...]) -> Sheet:
 
 
 def size_note(root: Path) -> str | None:
-    """A plain word on results that are not of the thesis's sizes."""
-    return None if root.name == "thesis" else f"preset {root.name}: not comparable in size"
+    """A plain word on results that are not of the thesis's sizes, and on settings overridden."""
+    changed = changed_settings(root)
+    if root.name == "thesis" and not changed:
+        return None
+    return f"preset {', '.join([root.name, *changed])}: not comparable in size"
 
 
 def _title(table: Table) -> str:
