@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from made_up_results import write_folder
 
+from dreamer_jax.config import preset
 from dreamer_jax.video import write_video
 from experiments import comparison, figures, grid, page, publication, results
 from experiments.contradictions import CONTRADICTIONS
@@ -482,3 +483,20 @@ def test_the_demo_is_a_table_too(tmp_path):
     text = publication.write_table(grid.DEMO, root, SEEDS, tmp_path / "out")
     assert text.startswith("Demo: InvertedPendulum, overall return")
     assert "120 ± 12 | 856 ± 121" in text
+
+
+def test_settings_that_are_not_the_presets_are_named(tmp_path):
+    root = tmp_path / "cpu"
+
+    def write(name, cells, environment_steps):
+        schedule = dataclasses.replace(preset("cpu").schedule, environment_steps=environment_steps)
+        config = dataclasses.replace(preset("cpu"), schedule=schedule)
+        write_folder(root, name, cells, lambda cell, task, count: [0.0] * count, config)
+
+    write("alone", [grid.baseline("bullet", "Ant", 0)], 200_000)
+    assert publication.size_note(root) == "preset cpu: not comparable in size"
+    # An agent for two tasks takes twice the environment steps.
+    write("source", [grid.multitask("bullet", ("Hopper", "Ant"), 0)], 60_000)
+    write("short", [grid.baseline("bullet", "Hopper", 0)], 30_000)
+    expected = "preset cpu, environment_steps 30000: not comparable in size"
+    assert publication.size_note(root) == expected
