@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import optax
 import pytest
+from compilation import QUICK_CODE
 from numpy.testing import assert_allclose, assert_array_equal
 from runs import CONFIG, batch_for, random_params, spec_of, write_run
 from transfer_trees import bits
@@ -213,7 +214,7 @@ def test_exactly_what_is_frozen_does_not_move_by_a_bit_in_a_thousand_updates(fol
     state, report = transferred_members(spec, sources)
     start, batch = member(state, 0), batch_for(agent)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=QUICK_CODE)
     def train(state):
         return jax.lax.fori_loop(0, 1000, lambda _, state: agent.update(state, batch)[0], state)
 

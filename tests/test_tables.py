@@ -106,7 +106,7 @@ def test_runs_say_where_their_sources_are_from_the_folder_of_all(root):
 
 def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(demo, root, written):
     before = metrics(root)
-    sweep = grid_commands.Sweep("debug", (0, 1), results=demo[0])
+    sweep = grid_commands.Sweep("debug", (0, 1), results=demo[0], config=CONFIG)
     figure = dataclasses.replace(grid.FIGURES["figure-36"], tasks=("InvertedPendulum",))
     assert grid_commands._make([grid.DEMO, figure], sweep) == 0
     assert written == [grid.DEMO, figure]
@@ -127,7 +127,7 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, 
             spec = dataclasses.replace(spec, sources=tuple(str(root / x) for x in spec.sources))
         finish(run, root)
         write_run(root / run.name, spec, seed, keep=True)
-    sweep = grid_commands.Sweep("debug", (0, 1), results=tmp_path)
+    sweep = grid_commands.Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)
     assert grid_commands._make([META], sweep) == 0
     assert len(targets.cells) == 2
     outcomes = read_outcomes(root, shown(META, (0, 1)))
@@ -160,7 +160,7 @@ def classified(tmp_path_factory):
 
 def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatch, written):
     monkeypatch.setattr(latent_tables, "gather", None)
-    sweep = grid_commands.Sweep("debug", results=classified.parent)
+    sweep = grid_commands.Sweep("debug", results=classified.parent, config=CONFIG)
     entries = [TABLES[f"table-{number}"] for number in (13, 14, 15)]
     assert grid_commands._make(entries, sweep) == 0
     for entry in entries:
@@ -227,7 +227,10 @@ def test_results_of_another_preset_are_refused_with_the_difference(demo, tmp_pat
         (["table", "18"], "unknown table '18': choose from 1 to 17, or all"),
         (["figure", "9"], "unknown figure '9': choose from 10 to 39, or all"),
         (["table"], "no table named: choose from 1 to 17"),
-        (["table", "3", "--preset", "thsis"], "Expected one of ('thesis', 'cpu', 'demo', 'debug')"),
+        (
+            ["table", "3", "--preset", "thsis"],
+            "unknown preset 'thsis' (did you mean 'thesis'?); the presets are thesis, cpu",
+        ),
         (["table", "3", "--backend", "mujoco"], "Expected one of ('bullet', 'brax')"),
         (["table", "3", "--seeds", "1", "1"], "each named once"),
         (["plan"], "add --table 3"),

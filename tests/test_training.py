@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilation import update_with_quick_code
 from probes import BrokenProbe, Probe, Walk
 
 from dreamer_jax import config as configs
@@ -329,7 +330,8 @@ def learning_config(environment_steps):
     )
 
 
-def test_the_probe_is_solved_in_seconds(tmp_path):
+def test_the_probe_is_solved_in_seconds(tmp_path, monkeypatch):
+    update_with_quick_code(monkeypatch)
     # The best action is 0.5 everywhere, with reward 1 a step; a random one scores -1/3.
     config = learning_config(1300)
     agent, env = Agent(config, 2), Probe(falls=False)
@@ -338,7 +340,8 @@ def test_the_probe_is_solved_in_seconds(tmp_path):
     assert score > 0.8 * config.schedule.phase_ticks
 
 
-def test_discrete_choices_are_learned_with_their_values(tmp_path):
+def test_discrete_choices_are_learned_with_their_values(tmp_path, monkeypatch):
+    update_with_quick_code(monkeypatch)
     config = learning_config(2000)
     agent, env, ticks = Agent(config, 3, discrete=True), Walk(), config.schedule.phase_ticks
     run, _ = trained(tmp_path, agent=agent, env=env, members=(Member(0, "probe"),))

@@ -1,0 +1,19 @@
+"""Quick code for tests that run it for long; the others compile quickly instead (conftest.py)."""
+
+from dreamer_jax import training
+
+QUICK_CODE = {"xla_backend_optimization_level": 2, "xla_cpu_use_fusion_emitters": True}
+"""Options of `jax.jit` and of `compile`."""
+
+
+def update_with_quick_code(monkeypatch):
+    """Lets runs compile their updates, the same ones, to quick code."""
+    original, compiled = training.update_members, {}
+
+    def update(agent, *arguments, **options):
+        key = (agent, *options.items())
+        if key not in compiled:
+            compiled[key] = original.lower(agent, *arguments, **options).compile(QUICK_CODE)
+        return compiled[key](*arguments)
+
+    monkeypatch.setattr(training, "update_members", update)
