@@ -49,7 +49,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return USAGE
-    except (OSError, SimulatorError, NonFiniteError, CorruptCheckpointError) as error:
+    except (
+        OSError,
+        ModuleNotFoundError,
+        SimulatorError,
+        NonFiniteError,
+        CorruptCheckpointError,
+    ) as error:
         print(f"error: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:

@@ -16,7 +16,7 @@ import numpy as np
 import envs
 from experiments.agents import Source
 from experiments.latents import Features, Latents, Policy, gather, phases_for
-from experiments.report import aligned
+from experiments.report import aligned, titles
 from transfer import ltc
 from transfer.recipes import latent_task_thresholds
 
@@ -222,19 +222,16 @@ def judge(
     )
 
 
-def _title(task: str) -> str:
-    return envs.spec(task).title
-
-
 def table(outcome: Outcome) -> str:
     """Accuracies in the form of Tables 13 to 15.
 
     A row for each threshold; for a novel task the share taken for novel, for a known one the share
     taken for not novel / the share whose neighbours vote for the right task.
     """
+    called = titles(outcome.tasks)
     header = ["threshold"]
-    header += [f"{_title(task)}, novel" for task in outcome.novel]
-    header += [_title(task) for task in outcome.known]
+    header += [f"{called[task]}, novel" for task in outcome.novel]
+    header += [called[task] for task in outcome.known]
     rows = []
     for threshold, accuracies in zip(outcome.thresholds, outcome.accuracies, strict=True):
         suggested = len(rows) == len(outcome.thresholds) - 1
@@ -250,11 +247,11 @@ def table(outcome: Outcome) -> str:
 
 def distance_table(outcome: Outcome) -> str:
     """Distances to the nearest fitted sample, and what the neighbours took each task for."""
-    rows = []
+    rows, called = [], titles(outcome.tasks)
     for task in outcome.tasks:
         distances = outcome.distances[task]
-        votes = ", ".join(f"{_title(name)} {n}" for name, n in outcome.votes[task].most_common())
-        name = _title(task) + ("" if task in outcome.known else ", novel")
+        votes = ", ".join(f"{called[name]} {n}" for name, n in outcome.votes[task].most_common())
+        name = called[task] + ("" if task in outcome.known else ", novel")
         rows.append(
             [name, f"{np.median(distances):.4g}", f"{distances.min():.4g}"]
             + [f"{distances.max():.4g}", votes]
@@ -305,12 +302,12 @@ def plot(outcome: Outcome, stem: str | Path) -> list[Path]:
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(12.8, 4.8), layout="constrained")
     parts = [*outcome.fitted.values(), *outcome.tested.values()]
     mean, directions, shares = principal_components(np.concatenate([x.features for x in parts]))
-    palette = pyplot.get_cmap("tab10")
+    palette, called = pyplot.get_cmap("tab10"), titles(outcome.tasks)
     random = np.random.default_rng(0)
     for number, task in enumerate(outcome.tasks):
         known, color = task in outcome.known, palette(number % 10)
         x, y = ((outcome.tested[task].features - mean) @ directions.T).T
-        label = _title(task) + ("" if known else " (novel)")
+        label = called[task] + ("" if known else " (novel)")
         left.scatter(
             x, y, label=label, color=color, s=18 if known else 30, marker="o" if known else "x"
         )
@@ -329,7 +326,7 @@ def plot(outcome: Outcome, stem: str | Path) -> list[Path]:
     right.axvline(outcome.thresholds[-1], color="black", linewidth=0.8)
     right.set_yticks(
         range(len(outcome.tasks)),
-        [_title(task) + ("" if task in outcome.known else " (novel)") for task in outcome.tasks],
+        [called[task] + ("" if task in outcome.known else " (novel)") for task in outcome.tasks],
     )
     right.set_xlim(left=0)
     right.invert_yaxis()

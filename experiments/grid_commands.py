@@ -244,8 +244,9 @@ def _write(
 ) -> None:
     """Writes tables, figures, and the page of all results under a root."""
     from experiments import page, publication
+    from experiments.results import report_folder
 
-    folder = root / "report"
+    folder = report_folder(root, backend)
     folder.mkdir(parents=True, exist_ok=True)
     for entry in entries:
         if isinstance(entry, Table):

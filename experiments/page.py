@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
+from envs import SimulatorError
 from experiments import comparison, figures, grid, publication, published, results
 from experiments.comparison import Aggregate
 from experiments.contradictions import CONTRADICTIONS
@@ -237,7 +238,7 @@ def _figure(
                 (picture,) = figures.draw_tasks(figure, stem, formats=(".png",))
             else:
                 (picture,) = figures.draw_curves(figure, outcomes, seeds, size, stem, (".png",))
-        except ModuleNotFoundError as error:
+        except (ModuleNotFoundError, SimulatorError) as error:
             return _captioned(figure.name, _open(error), caption)
         return _captioned(figure.name, _image(picture, caption), caption)
 

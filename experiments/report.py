@@ -6,6 +6,7 @@ all these returns, of all seeds together, as in the thesis (see `statistics.mean
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,14 @@ def evaluations(directory: str | Path) -> list[dict[str, Any]]:
 
 def _statistics(rows: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
     return mean_and_deviation([row["return"] for row in rows]) if rows else None
+
+
+def titles(tasks: Iterable[str]) -> dict[str, str]:
+    """What each of some tasks is called beside the others: its title, or its name where another
+    simulator's has the same."""
+    found = {task: envs.spec(task).title for task in tasks}
+    count = Counter(found.values())
+    return {task: title if count[title] == 1 else task for task, title in found.items()}
 
 
 def labels(spec: RunSpec) -> list[str]:
@@ -101,10 +110,10 @@ def table(summaries: Sequence[Summary]) -> str:
     def cell(statistics):
         return "-" if statistics is None else f"{statistics[0]:.0f} ± {statistics[1]:.0f}"
 
-    several = len({summary.task for summary in summaries}) > 1
+    called = titles(summary.task for summary in summaries)
     rows = []
     for summary in summaries:
-        name = summary.label + (f"  {envs.spec(summary.task).title}" if several else "")
+        name = summary.label + (f"  {called[summary.task]}" if len(called) > 1 else "")
         count = f"{summary.done}"
         if summary.done < summary.planned:
             count += f" of {summary.planned}, incomplete"
@@ -139,7 +148,7 @@ def plot_curves(directory: str | Path, path: str | Path | None = None) -> list[P
     figure, axes = pyplot.subplots(
         1, columns, figsize=(6.4 * columns, 4.2), squeeze=False, layout="constrained"
     )
-    names = labels(spec)
+    names, called = labels(spec), titles(spec.tasks)
     shades = pyplot.get_cmap("viridis")(np.linspace(0.0, 0.85, max(1, len(names))))
     for axis, task in zip(axes[0], spec.tasks, strict=True):
         for name, shade in zip(names, shades, strict=True):
@@ -155,7 +164,7 @@ def plot_curves(directory: str | Path, path: str | Path | None = None) -> list[P
             axis.fill_between(
                 steps, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, lw=0
             )
-        axis.set_title(envs.spec(task).title)
+        axis.set_title(called[task])
         axis.set_xlabel("environment steps")
         axis.set_ylabel("return of an evaluation episode")
         axis.grid(alpha=0.3)

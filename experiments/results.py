@@ -191,6 +191,11 @@ def latents_folder(root: str | Path, backend: Backend, seed: int) -> Path:
     return Path(root) / f"latents-{backend}-seed-{seed}"
 
 
+def report_folder(root: str | Path, backend: Backend) -> Path:
+    """Where tables, figures and the page are, each simulator's apart."""
+    return Path(root) / ("report" if backend == "bullet" else f"report-{backend}")
+
+
 def read_classification(
     root: str | Path, table: Table, seeds: tuple[int, ...] = SEEDS
 ) -> Classification | None:

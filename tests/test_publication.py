@@ -6,6 +6,7 @@ The runs are made up; see `made_up_results`.
 import base64
 import csv
 import dataclasses
+import html
 import re
 from collections import namedtuple
 
@@ -15,7 +16,8 @@ from made_up_results import write_folder
 
 from dreamer_jax.config import preset
 from dreamer_jax.video import write_video
-from experiments import comparison, figures, grid, page, publication, results
+from envs import SimulatorError
+from experiments import comparison, figures, grid, grid_commands, page, publication, report, results
 from experiments.contradictions import CONTRADICTIONS
 from experiments.grid import FIGURES, TABLES
 
@@ -468,13 +470,52 @@ def test_a_page_without_any_run_is_written(drawn, tmp_path):
     assert "No target is complete yet." in text and 'class="verdict' not in text
 
 
-def test_pictures_of_tasks_without_their_simulator_leave_a_note(root, drawn, monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    "error",
+    [
+        ModuleNotFoundError("pybullet is not installed: pip install 'x[bullet]'"),
+        SimulatorError("MUJOCO_GL=egl does not work"),
+    ],
+)
+def test_pictures_of_tasks_without_their_simulator_leave_a_note(
+    root, drawn, monkeypatch, tmp_path, error
+):
     def refuse(*arguments, **settings):
-        raise ModuleNotFoundError("pybullet is not installed: pip install 'x[bullet]'")
+        raise error
 
     monkeypatch.setattr(figures, "draw_tasks", refuse)
     text = page.write_page(root, SEEDS, "bullet", tmp_path / "index.html").read_text()
-    assert "pybullet is not installed" in text and 'id="figure-10"' in text
+    assert html.escape(str(error)) in text and 'id="figure-10"' in text
+
+
+@pytest.mark.parametrize(
+    "tasks, called",
+    [
+        (["bullet/hopper", "bullet/ant"], ["Hopper", "Ant"]),
+        (
+            ["bullet/hopper", "brax/hopper", "brax/ant"],
+            ["bullet/hopper", "brax/hopper", "Ant"],
+        ),
+    ],
+)
+def test_tasks_of_one_title_are_told_apart_by_their_names(tasks, called):
+    summaries = [report.Summary("seed", task, 1, 1, 1, (1.0, 0.0), (1.0, 0.0)) for task in tasks]
+    rows = report.table(summaries).splitlines()[2:]
+    assert [row.split()[:2] for row in rows] == [["seed", name] for name in called]
+
+
+def test_tables_of_both_simulators_stand_beside_one_another(root, drawn):
+    write_folder(root, "other", [grid.baseline("brax", TARGET, 0)], rising)
+    for backend in ("bullet", "brax"):
+        table = grid.on_backend(TABLES["table-7"], backend)
+        grid_commands._write([table], root, SEEDS, backend)
+    for folder, baseline, simulator in [
+        ("report", " 20 ± 12 |", "PyBullet"),
+        ("report-brax", "4 of 8 evaluations", "Brax"),
+    ]:
+        text = (root / folder / "table-7.txt").read_text(encoding="utf-8")
+        assert baseline in text and ("Ours are on brax" in text) == (simulator == "Brax")
+        assert f"{simulator}, seeds 0, 1" in (root / folder / "index.html").read_text("utf-8")
 
 
 def test_the_demo_is_a_table_too(tmp_path):
