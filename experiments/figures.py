@@ -11,6 +11,7 @@ import gymnasium
 
 import envs
 from experiments import comparison, grid
+from experiments.graph import task_name
 from experiments.grid import Cell, Figure
 from experiments.results import Outcome
 
@@ -180,20 +181,6 @@ def state(outcomes: Sequence[Outcome]) -> str:
     done = sum(len(outcome.env_steps) for outcome in outcomes)
     planned = max(outcome.planned for outcome in outcomes) * len(outcomes)
     return f", incomplete: {done} of {planned} evaluations" if done else ", not run"
-
-
-def task_name(backend: str, title: str) -> str:
-    """The name of a task of the thesis on a simulator.
-
-    Raises:
-      ValueError: the simulator does not have it.
-    """
-    for name in envs.task_names():
-        if name.startswith(f"{backend}/") and envs.spec(name).title == title:
-            return name
-    raise ValueError(
-        f"there is no task {title} of {backend}, the tasks are {', '.join(envs.task_names())}"
-    )
 
 
 def draw_tasks(

@@ -56,26 +56,25 @@ def task_name(backend: Backend, title: str) -> str:
     """The name of a task of the grid, such as "bullet/hopper" for Hopper on bullet.
 
     Raises:
-      ValueError: the backend has no such task.
+      ValueError: the backend has no such task; names the tasks there are.
     """
     names = envs.task_names()
     for name in names:
         if name.partition("/")[0] == backend and envs.spec(name).title == title:
             return name
-    backends = dict.fromkeys(name.partition("/")[0] for name in names)
-    raise ValueError(
-        f"the backend {backend} has no task {title}: the backends here are {', '.join(backends)}"
-    )
+    raise ValueError(f"there is no task {title} of {backend}, the tasks are {', '.join(names)}")
 
 
 def config_of(cell: Cell, config: Config) -> Config:
     """A preset's settings as a cell has them: agents for several tasks take more steps."""
     if len(cell.tasks) == 1:
         return config
-    steps = MULTITASK_STEPS * config.schedule.environment_steps
-    return dataclasses.replace(
-        config, schedule=dataclasses.replace(config.schedule, environment_steps=steps)
-    )
+    return _of_length(config, MULTITASK_STEPS * config.schedule.environment_steps)
+
+
+def _of_length(config: Config, environment_steps: int) -> Config:
+    schedule = dataclasses.replace(config.schedule, environment_steps=environment_steps)
+    return dataclasses.replace(config, schedule=schedule)
 
 
 def changed_settings(root: str | Path) -> tuple[str, ...]:
@@ -93,9 +92,7 @@ def changed_settings(root: str | Path) -> tuple[str, ...]:
             continue  # `read_outcomes` warns of it
         config = spec.config
         if len(spec.tasks) > 1:
-            steps = config.schedule.environment_steps // MULTITASK_STEPS
-            schedule = dataclasses.replace(config.schedule, environment_steps=steps)
-            config = dataclasses.replace(config, schedule=schedule)
+            config = _of_length(config, config.schedule.environment_steps // MULTITASK_STEPS)
         for text in configs.differences(config, configs.preset(root.name)):
             if not text.startswith(_OF_THE_MACHINE):
                 name, _, value = text.partition(" / ")[0].partition(": ")

@@ -6,7 +6,7 @@ import envs
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.schedule import Schedule
-from experiments.figures import task_name
+from experiments.graph import task_name
 from experiments.spec import RunSpec
 
 VERSIONS = {"python": "3.11.7", "jax": "0.10.2", "backend": "cpu"}
