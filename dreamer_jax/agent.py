@@ -13,7 +13,7 @@ Parameters are one dict whose names read like the thesis:
 
 import functools
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import chex
 import flax.struct
@@ -28,7 +28,8 @@ from dreamer_jax.convolutions import normalise_image
 
 Params = dict[str, Any]
 Metrics = dict[str, jax.Array]
-Mode = Literal["explore", "evaluate"]
+Mode = Literal["random", "explore", "evaluate"]
+MODES: tuple[Mode, ...] = get_args(Mode)
 
 
 class Carry(NamedTuple):
@@ -88,6 +89,13 @@ _INIT, _UPDATE = 0, 1
 def member_key(seed: jax.Array | int, purpose: int) -> jax.Array:
     """The key of a member for one purpose; members with one seed share it."""
     return jax.random.fold_in(jax.random.key(seed), purpose)
+
+
+def _one_of(condition: bool | jax.Array, yes, no):
+    """yes() or no(): chosen now, or as the program runs if the condition is traced."""
+    if isinstance(condition, bool):
+        return yes() if condition else no()
+    return jax.lax.cond(condition, yes, no)
 
 
 @dataclass(frozen=True)
@@ -289,7 +297,7 @@ class Agent:
         image: jax.Array,
         first: jax.Array,
         key: jax.Array,
-        mode: Mode,
+        mode: Mode | jax.Array,
         updates: jax.Array | int = 0,
     ) -> tuple[jax.Array, Carry]:
         """Chooses an action for one image.
@@ -300,30 +308,42 @@ class Agent:
           image: uint8 [size, size, 3].
           first: bool [], whether the image is the first of an episode.
           key: for the latent sample, the action and the exploration.
-          mode: "explore" adds exploration to a sample; "evaluate" takes the mode, without noise.
+          mode: "random" looks at nothing; "explore" adds exploration to a sample; "evaluate" takes
+            the mode, without noise. Or its index in `MODES`, int32 []: one program for all three.
           updates: int [], updates so far, for the schedule of epsilon-greedy.
 
         Returns:
           The action, float32 [A], and the new memory.
         """
-        if mode not in ("explore", "evaluate"):
-            raise ValueError(f"unknown policy mode {mode!r}: choose 'explore' or 'evaluate'")
-        latent_key, action_key, explore_key = jax.random.split(key, 3)
-        variables = {"params": params["dynamics"]}
-        projected = self.dynamics.apply(
-            variables, self.encode(params, image[None])[0], method="project"
-        )
-        noise = jax.random.normal(latent_key, carry.state.stochastic.shape)
-        state = self.dynamics.apply(
-            variables, carry.state, carry.action, projected, first, noise, method="obs_step"
-        )
-        outputs = self.head(params, "actor", state.features)
-        if mode == "evaluate":
-            action = self._mode(outputs, action_key)
-        else:
-            action = self.sample(outputs, self.action_noise(action_key, ()))
-            action = self._explore(action, explore_key, updates)
-        return action, Carry(state, action)
+        if isinstance(mode, str):
+            if mode not in MODES:
+                raise ValueError(f"unknown policy mode {mode!r}: choose one of {', '.join(MODES)}")
+            mode = MODES.index(mode)
+
+        def at_random() -> tuple[jax.Array, Carry]:
+            return self.random_action(key), carry
+
+        def by_actor() -> tuple[jax.Array, Carry]:
+            latent_key, action_key, explore_key = jax.random.split(key, 3)
+            variables = {"params": params["dynamics"]}
+            embedded = self.encode(params, image[None])[0]
+            projected = self.dynamics.apply(variables, embedded, method="project")
+            noise = jax.random.normal(latent_key, carry.state.stochastic.shape)
+            state = self.dynamics.apply(
+                variables, carry.state, carry.action, projected, first, noise, method="obs_step"
+            )
+            outputs = self.head(params, "actor", state.features)
+
+            def explored() -> jax.Array:
+                action = self.sample(outputs, self.action_noise(action_key, ()))
+                return self._explore(action, explore_key, updates)
+
+            action = _one_of(
+                mode == MODES.index("evaluate"), lambda: self._mode(outputs, action_key), explored
+            )
+            return action, Carry(state, action)
+
+        return _one_of(mode == MODES.index("random"), at_random, by_actor)
 
     def random_action(self, key: jax.Array) -> jax.Array:
         """A uniformly random action, float32 [A]."""

@@ -9,18 +9,16 @@ resets.
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, Params, member_key
+from dreamer_jax.agent import MODES, Agent, Mode, Params, member_key
 
-Collection = Literal["random", "explore", "evaluate"]
-
-# Salts of the three kinds of phases; 0 and 1 are taken by dreamer_jax.agent.
-_SALTS = {"random": 2, "explore": 2, "evaluate": 3}
+# Salts of the keys of phases, by number of the mode; 0 and 1 are taken by dreamer_jax.agent.
+_SALTS = (2, 2, 3)
 
 
 class Records(NamedTuple):
@@ -74,13 +72,13 @@ def rollout(env, policy: Callable, carry, slot: jax.Array, key: jax.Array, ticks
     return Records(steps.image, actions, steps.reward, steps.first, steps.terminal)
 
 
-def phase_key(seed: jax.Array, task: jax.Array, kind: Collection, phase: jax.Array) -> jax.Array:
-    """The key of one phase: of (member seed, task, collect or evaluate, phase)."""
-    key = member_key(seed, _SALTS[kind])
+def phase_key(seed: jax.Array, task: jax.Array, mode: jax.Array, phase: jax.Array) -> jax.Array:
+    """The key of one phase: of (member seed, task, collect or evaluate, phase); `mode` is an index
+    in `MODES`."""
+    key = member_key(seed, jnp.array(_SALTS)[mode])
     return jax.random.fold_in(jax.random.fold_in(key, task), phase)
 
 
-@functools.partial(jax.jit, static_argnames=("agent", "env", "tasks", "ticks", "kind"))
 def collect(
     agent: Agent,
     env,
@@ -91,9 +89,11 @@ def collect(
     *,
     tasks: int,
     ticks: int,
-    kind: Collection,
+    mode: Mode,
 ) -> Records:
     """One phase of every task by every member, all simulators in step.
+
+    The three modes share one compiled program.
 
     Args:
       agent: the agent's functions.
@@ -104,19 +104,24 @@ def collect(
       phase: int32 [], number of the phase.
       tasks: K.
       ticks: T.
-      kind: "random" (prefill), "explore" or "evaluate" (the mode, without noise).
+      mode: "random" (prefill), "explore" or "evaluate" (the mode, without noise).
 
     Returns:
       Records with leading axes [P, K, T + 1].
     """
+    number = jnp.int32(MODES.index(mode))
+    return _collect(agent, env, params, seeds, updates, phase, number, tasks=tasks, ticks=ticks)
+
+
+@functools.partial(jax.jit, static_argnames=("agent", "env", "tasks", "ticks"))
+def _collect(agent, env, params, seeds, updates, phase, mode, *, tasks, ticks) -> Records:
+    """`collect` of a mode that is known only as it runs."""
 
     def one(params, seed, updates, task, slot):
         def policy(carry, image, first, key):
-            if kind == "random":
-                return agent.random_action(key), carry
-            return agent.policy(params, carry, image, first, key, kind, updates)
+            return agent.policy(params, carry, image, first, key, mode, updates)
 
-        key = phase_key(seed, task, kind, phase)
+        key = phase_key(seed, task, mode, phase)
         return rollout(env, policy, agent.initial_carry(), slot, key, ticks)
 
     members = seeds.shape[0]

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, AgentState, Batch
+from dreamer_jax.agent import Agent, AgentState, Batch, Mode
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from dreamer_jax.logs import MetricsWriter
 from dreamer_jax.population import init_members, update_members, zero_sums
@@ -269,7 +269,7 @@ class Run:
             "updates": self.counters.updates,
         }
 
-    def _phase(self, kind, phase: int) -> Records:
+    def _phase(self, mode: Mode, phase: int) -> Records:
         started = time.perf_counter()
         records = collect(
             self.agent,
@@ -280,17 +280,17 @@ class Run:
             jnp.int32(phase),
             tasks=len(self.tasks),
             ticks=self.schedule.config.phase_ticks,
-            kind=kind,
+            mode=mode,
         )
         records = Records(*(np.asarray(x) for x in records))
         self.env.check()
-        self._time("evaluate" if kind == "evaluate" else "collect", started)
+        self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
-    def _collect(self, kind: Literal["random", "explore"]) -> None:
-        self._bar.update(phase="collecting at random" if kind == "random" else "collecting")
+    def _collect(self, mode: Mode) -> None:
+        self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
         rounds = self.counters.rounds
-        records = self._phase(kind, rounds)
+        records = self._phase(mode, rounds)
         self.replay.append(records._asdict())
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
@@ -300,7 +300,7 @@ class Run:
                 "kind": "collect",
                 **self._columns(member, rounds + 1),
                 "task": self.tasks[task],
-                "policy": kind,
+                "policy": mode,
                 "episodes": len(found),
                 "return": float(scores[-1]),
                 "length": float(np.mean([episode.length for episode in found])),

@@ -9,7 +9,7 @@ Axis letters: P population member, K task, T ticks in a phase, A action.
 import dataclasses
 import functools
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -38,7 +38,9 @@ class Speed:
       update_bytes: memory that it takes beside the member's state and batch.
       policy_seconds: choosing one action for one member.
       tick_seconds: one tick of one simulator, by name of task.
-      compile_seconds: until the functions of one run are compiled.
+      compile_seconds: until an update and a policy are compiled.
+      tick_compile_seconds: until a tick of a simulator is, by name of task; physics that is part
+        of the program takes long.
       workers: simulator processes that work at once.
     """
 
@@ -47,6 +49,7 @@ class Speed:
     policy_seconds: float
     tick_seconds: Mapping[str, float]
     compile_seconds: float
+    tick_compile_seconds: Mapping[str, float]
     workers: int
 
 
@@ -90,15 +93,22 @@ def _compiled_update(agent: Agent):
     return lowered.compile(), state, sums, batch
 
 
-def measure(specs: Iterable[RunSpec]) -> Speed:
+def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what: None) -> Speed:
     """Measures the updates and the simulators of runs of one preset.
 
-    A plain agent of the largest action size stands for all of them.
+    A plain agent of the largest action size stands for all of them. Nearly all of the time goes to
+    compilation, half a minute or so for each thing to be measured.
+
+    Args:
+      specs: the runs.
+      tell: is told what is measured next.
     """
     specs = tuple(specs)
     tasks = tuple(dict.fromkeys(task for spec in specs for task in spec.tasks))
+    things = len(tasks) + 1
     widest = max(tasks, key=lambda task: envs.spec(task).action_size)
     agent = make_agent(RunSpec((widest,), (0,), specs[0].config))
+    tell(f"[1/{things}] an update and a policy")
     started = time.perf_counter()
     update, state, sums, batch = _compiled_update(agent)
     policy_seconds = _policy_seconds(agent, state.params)
@@ -114,16 +124,18 @@ def measure(specs: Iterable[RunSpec]) -> Speed:
         loss.block_until_ready()
         updates += 1
     update_seconds = (time.perf_counter() - started) / updates
-    config = agent.config
+    image_size, repeat = agent.config.network.image_size, agent.config.schedule.action_repeat
+    ticks = {}
+    for number, task in enumerate(tasks, start=2):
+        tell(f"[{number}/{things}] {task}")
+        ticks[task] = _tick_seconds(task, image_size, repeat)
     return Speed(
         update_seconds=update_seconds,
         update_bytes=update_bytes,
         policy_seconds=policy_seconds,
-        tick_seconds={
-            task: _tick_seconds(task, config.network.image_size, config.schedule.action_repeat)
-            for task in tasks
-        },
+        tick_seconds={task: each for task, (each, _) in ticks.items()},
         compile_seconds=compile_seconds,
+        tick_compile_seconds={task: first for task, (_, first) in ticks.items()},
         workers=available_cores(),
     )
 
@@ -149,10 +161,12 @@ def _policy_seconds(agent: Agent, params) -> float:
     return (time.perf_counter() - started) / TICKS
 
 
-def _tick_seconds(task: str, image_size: int, action_repeat: int) -> float:
-    """Seconds for a tick of one simulator, what carries it to jitted code included."""
+def _tick_seconds(task: str, image_size: int, action_repeat: int) -> tuple[float, float]:
+    """Seconds for a tick of one simulator, what carries it to jitted code included, and seconds
+    until the first."""
     env = envs.make([task], 1, image_size, action_repeat, workers=1)
     try:
+        made = time.perf_counter()
         state, _ = jax.jit(jax.vmap(env.reset))(
             jnp.arange(1), jax.random.split(jax.random.key(0), 1)
         )
@@ -163,11 +177,12 @@ def _tick_seconds(task: str, image_size: int, action_repeat: int) -> float:
             return jax.lax.scan(jax.vmap(env.step), state, actions)
 
         state, _ = jax.block_until_ready(play(state, jax.random.key(1)))
+        first_seconds = time.perf_counter() - made
         started = time.perf_counter()
         jax.block_until_ready(play(state, jax.random.key(2)))
         seconds = time.perf_counter() - started
         env.check()
-        return seconds / TICKS
+        return seconds / TICKS, first_seconds
     finally:
         env.close()
 
@@ -225,7 +240,8 @@ def estimate(run: PlannedRun, speed: Speed) -> Estimate:
     disk = slots * records * _record_bytes(spec)
     disk += CHECKPOINTS * members * _member_bytes(make_agent(spec))
     memory = _memory(spec, speed.update_bytes, _chunk(spec))
-    return Estimate(seconds + speed.compile_seconds, memory, disk)
+    seconds += speed.compile_seconds + sum(speed.tick_compile_seconds[task] for task in spec.tasks)
+    return Estimate(seconds, memory, disk)
 
 
 def in_memory(spec: RunSpec) -> RunSpec:

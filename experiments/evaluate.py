@@ -85,7 +85,7 @@ def evaluate(
                 jnp.int32(FIRST_PHASE + number),
                 tasks=len(spec.tasks),
                 ticks=spec.config.schedule.phase_ticks,
-                kind="evaluate",
+                mode="evaluate",
             )
             records = Records(*(np.asarray(x) for x in records))
             env.check()

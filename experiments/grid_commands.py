@@ -73,7 +73,8 @@ class Figures:
 class Plan:
     """Show the runs that tables and figures need, and what they will take, without running them.
 
-    Time, memory and disk are estimates, from a measurement of a few seconds on this machine.
+    Time, memory and disk are estimates, from a short measurement on this machine: half a minute
+    for each simulator and one for updates, most of it compilation.
     """
 
     table: tuple[str, ...] = ()
@@ -204,7 +205,12 @@ def plan(command: Plan) -> int:
         ]
     runs = _planned(entries, sweep)
     due = [run for run in runs if run.state in ("missing", "cut")]
-    speed = estimate.measure(run.spec for run in due) if due else None
+    speed = None
+    if due:
+        print("measuring how fast this machine is:", file=sys.stderr)
+        speed = estimate.measure(
+            (run.spec for run in due), lambda what: print(f"  {what}", file=sys.stderr, flush=True)
+        )
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, speed))
     if speed is not None:

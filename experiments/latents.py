@@ -131,7 +131,7 @@ def gather(
                 jnp.int32(FIRST_PHASE + phase),
                 tasks=len(tasks),
                 ticks=source.spec.config.schedule.phase_ticks,
-                kind="random" if policy == "random" else "evaluate",
+                mode="random" if policy == "random" else "evaluate",
             )
             records = Records(*(np.asarray(x)[0] for x in records))
             env.check()

@@ -13,7 +13,7 @@ from flax import linen as nn
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dreamer_jax import networks, rssm
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import MODES, Agent, Batch
 from dreamer_jax.config import preset
 from dreamer_jax.learning import behaviour_loss, model_loss
 from dreamer_jax.population import map_members
@@ -442,8 +442,27 @@ def test_exploration_stays_in_the_range_of_actions(agent, state):
     assert actions.std() > 0.2
 
 
+def test_a_mode_can_be_chosen_as_the_program_runs(agent, state):
+    image = batch_of().image[0, 0]
+
+    def act(mode):
+        key = jax.random.key(3)
+        return agent.policy(state.params, agent.initial_carry(), image, jnp.bool_(True), key, mode)
+
+    traced = jax.jit(act)
+    actions = []
+    for number, mode in enumerate(MODES):
+        action, carry = traced(jnp.int32(number))
+        chex.assert_trees_all_close(
+            (action, carry), jax.jit(act, static_argnums=0)(mode), atol=1e-5
+        )
+        assert carry.action.any() != (mode == "random"), "who acts at random remembers nothing"
+        actions.append(action)
+    assert len(np.unique(actions, axis=0)) == 3
+
+
 def test_an_unknown_policy_mode_is_refused(agent, state):
-    with pytest.raises(ValueError, match="'explore' or 'evaluate'"):
+    with pytest.raises(ValueError, match="choose one of random, explore, evaluate"):
         agent.policy(
             state.params,
             agent.initial_carry(),

@@ -34,7 +34,7 @@ def stored_batches(agent):
         jnp.int32(0),
         tasks=1,
         ticks=STORED * B * L - 1,
-        kind="random",
+        mode="random",
     )
     return Batch(*(x[0, 0].reshape(STORED, B, L, *x.shape[3:]) for x in records))
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from probes import Probe
 
-from dreamer_jax.agent import Agent
+from dreamer_jax import rollout as rollouts
+from dreamer_jax.agent import MODES, Agent
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import Records, collect, episodes, phase_key, rollout
 
@@ -76,24 +77,24 @@ def test_episodes_by_hand():
     assert episodes(records) == [(0, 2, 3.0, True), (3, 2, 7.0, False)]
 
 
-def test_keys_of_phases_differ_by_member_task_kind_and_phase():
+def test_keys_of_phases_differ_by_member_task_mode_and_phase():
     keys = {
-        tuple(jax.random.key_data(phase_key(seed, task, kind, phase)).tolist())
+        tuple(jax.random.key_data(phase_key(seed, task, MODES.index(mode), phase)).tolist())
         for seed in range(3)
         for task in range(2)
-        for kind in ("explore", "evaluate")
+        for mode in ("explore", "evaluate")
         for phase in range(3)
     }
     assert len(keys) == 3 * 2 * 2 * 3
 
 
-def collected(seeds, kind="random", phase=0, tasks=2):
+def collected(seeds, mode="random", phase=0, tasks=2):
     agent = Agent(preset("debug"), 2)
     seeds = jnp.array(seeds, jnp.int32)
     params = jax.jit(jax.vmap(agent.init_params))(jax.vmap(jax.random.key)(seeds))
     env = Probe()
     records = collect(
-        agent, env, params, seeds, seeds * 0, jnp.int32(phase), tasks=tasks, ticks=T, kind=kind
+        agent, env, params, seeds, seeds * 0, jnp.int32(phase), tasks=tasks, ticks=T, mode=mode
     )
     return jax.tree.map(np.asarray, records)
 
@@ -110,3 +111,17 @@ def test_a_policy_collects_the_same_again_and_other_things_in_another_phase():
     for a, b in zip(one, again, strict=True):
         assert_array_equal(a, b)
     assert (one.action != other.action).any()
+
+
+def test_modes_act_differently_in_one_compiled_program():
+    agent, env, seeds = Agent(preset("debug"), 2), Probe(), jnp.zeros(1, jnp.int32)
+    params = jax.vmap(agent.init_params)(jax.random.split(jax.random.key(0), 1))
+    before = rollouts._collect._cache_size()
+    actions = [
+        collect(
+            agent, env, params, seeds, seeds, jnp.int32(0), tasks=1, ticks=T, mode=mode
+        ).action.reshape(-1)
+        for mode in MODES
+    ]
+    assert len(np.unique(actions, axis=0)) == 3
+    assert rollouts._collect._cache_size() == before + 1

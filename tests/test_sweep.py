@@ -135,12 +135,14 @@ def test_two_sweeps_at_once_are_refused(tmp_path):
 
 # --- what it will take ------------------------------------------------------------------------
 
+TASKS = ("bullet/hopper", "bullet/walker2d", "bullet/halfcheetah")
 SPEED = Speed(
     update_seconds=0.5,
     update_bytes=1000,
     policy_seconds=0.0,
-    tick_seconds=dict.fromkeys(("bullet/hopper", "bullet/walker2d", "bullet/halfcheetah"), 0.01),
+    tick_seconds=dict.fromkeys(TASKS, 0.01),
     compile_seconds=0.0,
+    tick_compile_seconds=dict.fromkeys(TASKS, 0.0),
     workers=1,
 )
 
@@ -169,6 +171,8 @@ def test_time_is_linear_in_each_speed_and_falls_with_what_is_done(tmp_path):
         seconds() - seconds(tick_seconds=dict.fromkeys(ticks, 0.0))
     )
     assert seconds(workers=2, update_seconds=0.0) == seconds(update_seconds=0.0) / 2
+    compiling = dict.fromkeys(TASKS, 7.0)
+    assert seconds(tick_compile_seconds=compiling) == seconds() + 7.0 * len(targets.spec.tasks)
     half = dataclasses.replace(targets, state="cut", progress=0.5)
     assert seconds(half) == pytest.approx(seconds() / 2)
 
