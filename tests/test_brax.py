@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from probes import Probe
 
 import envs
 from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
 from envs.mixed import MixedEnv
+from probes import Probe
 
 NAMES = [name for name in envs.task_names() if name.startswith("brax/")]
 TITLES = [envs.spec(name).title for name in NAMES]

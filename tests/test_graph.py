@@ -4,13 +4,13 @@ import dataclasses
 import shutil
 
 import pytest
-from runs import CONFIG, finish
 
 from dreamer_jax.config import preset
 from experiments import grid
 from experiments.graph import plan_runs
 from experiments.grid import FIGURES, TABLES, closure, shown
 from experiments.results import folders, read_cells, read_outcomes
+from runs import CONFIG, finish
 
 
 def cells_of(*entries, seeds=grid.SEEDS):

@@ -8,12 +8,10 @@ import jax
 import numpy as np
 import optax
 import pytest
-from compilation import QUICK_CODE
 from numpy.testing import assert_allclose, assert_array_equal
-from runs import CONFIG, batch_for, random_params, spec_of, write_run
-from transfer_trees import bits
 
 import transfer
+from compilation import QUICK_CODE
 from dreamer_jax import rssm
 from dreamer_jax.agent import Batch
 from dreamer_jax.networks import Head
@@ -23,7 +21,9 @@ from experiments.agents import make_agent, plan
 from experiments.latents import infer
 from experiments.meta_modules import recognise
 from experiments.methods import load_sources, stored_models, transferred_members
+from runs import CONFIG, batch_for, random_params, spec_of, write_run
 from transfer.ltc import NOVEL
+from transfer_trees import bits
 
 M = CONFIG.network.feature_size
 random = np.random.default_rng(0)

@@ -5,12 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from compilation import QUICK_CODE
-from probes import Probe
 
+from compilation import QUICK_CODE
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import collect
+from probes import Probe
 
 A, STORED, UPDATES, SEEDS = 2, 10, 300, 4
 CONFIG = preset("debug")

@@ -12,7 +12,6 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
-from made_up_results import write_folder
 
 from dreamer_jax.config import preset
 from dreamer_jax.video import write_video
@@ -20,6 +19,7 @@ from envs import SimulatorError
 from experiments import comparison, figures, grid, grid_commands, page, publication, report, results
 from experiments.contradictions import CONTRADICTIONS
 from experiments.grid import FIGURES, TABLES
+from made_up_results import write_folder
 
 SEEDS = (0, 1)
 TARGET = "InvertedPendulum"

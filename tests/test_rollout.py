@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from probes import Probe
 
 from dreamer_jax import rollout as rollouts
 from dreamer_jax.agent import MODES, Agent
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import Records, collect, episodes, phase_key, rollout
+from probes import Probe
 
 T = 30
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from runs import CONFIG, finish
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from envs import SimulatorError
@@ -15,6 +14,7 @@ from experiments.graph import plan_runs
 from experiments.grid import TABLES, closure, shown
 from experiments.results import folders
 from experiments.sweep import carry_out_runs
+from runs import CONFIG, finish
 
 TWO_TARGETS = (
     dataclasses.replace(TABLES["table-3"], counts=(2,), omegas=(0.1, 0.2)),
@@ -250,7 +250,6 @@ def test_runs_of_every_method_can_be_estimated():
     hopper = dataclasses.replace(TABLES["table-16"], targets=("Hopper",))
     runs = plan_runs(shown(hopper), CONFIG, "nowhere")
     assert {run.spec.method for run in runs} == {"fractional", "uae", "meta"}
-    speed = dataclasses.replace(
-        SPEED, tick_seconds={task: 0.01 for run in runs for task in run.spec.tasks}
-    )
+    ticks = {task: 0.01 for run in runs for task in run.spec.tasks}
+    speed = dataclasses.replace(SPEED, tick_seconds=ticks, tick_compile_seconds=ticks)
     assert all(estimate.estimate(run, speed).memory > 0 for run in runs)

@@ -6,7 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-from runs import CONFIG, finish, write_run
 
 import envs
 from dreamer_jax.files import read_json
@@ -16,6 +15,7 @@ from experiments.__main__ import main
 from experiments.graph import plan_runs
 from experiments.grid import TABLES, shown
 from experiments.results import folders, latents_folder, read_classification, read_outcomes
+from runs import CONFIG, finish, write_run
 
 pytest.importorskip("pybullet")
 

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compilation import update_with_quick_code
-from probes import BrokenProbe, Probe, Walk
 
+from compilation import update_with_quick_code
 from dreamer_jax import config as configs
 from dreamer_jax import training
 from dreamer_jax.agent import Agent, Batch
@@ -20,6 +19,7 @@ from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import update_members
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.training import Member, NonFiniteError, Run
+from probes import BrokenProbe, Probe, Walk
 
 CONFIG = preset("debug")
 # Shared, so that all runs of these tests share their compiled functions.

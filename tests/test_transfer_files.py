@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from transfer_trees import LIBRARIES, assert_same_kind, bits, library_tree, like, trees
 
 import transfer
+from transfer_trees import LIBRARIES, assert_same_kind, bits, library_tree, like, trees
 
 NAMES = ("source.npz", "source.safetensors", "checkpoint")
 TREE = {

@@ -9,10 +9,10 @@ import optax
 import pytest
 from flax import nnx
 from hypothesis import strategies as st
-from transfer_trees import NnxNet, bits, library_tree, trees
 
 import transfer
 from transfer.freeze import combine, partition
+from transfer_trees import NnxNet, bits, library_tree, trees
 
 PARAMS = {
     "encoder": {"kernel": jnp.array([1.0, -0.0, -2.0]), "bias": jnp.array([0.5])},

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from transfer_trees import bits
 
 import transfer
 from transfer.ltc import NOVEL
 from transfer.meta_model import meta_inputs, predictions, store, switch
+from transfer_trees import bits
 
 M, HIDDEN = 5, 7
 FEATURES = jnp.asarray(np.random.default_rng(9).standard_normal((3, 4, M)), jnp.float32)

@@ -9,6 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+
+import transfer
+from transfer import OPERATIONS, Plan, Rule, apply, claims, plan_files
 from transfer_trees import (
     LIBRARIES,
     assert_same_kind,
@@ -18,9 +21,6 @@ from transfer_trees import (
     like,
     trees,
 )
-
-import transfer
-from transfer import OPERATIONS, Plan, Rule, apply, claims, plan_files
 
 KEY = jax.random.key(0)
 TARGET = {"body": {"w": jnp.zeros(2)}, "head": {"w": jnp.array([3.0, 4.0])}, "new": jnp.ones(3)}

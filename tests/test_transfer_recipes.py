@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from transfer_trees import bits
 
 import transfer
 from dreamer_jax import config
 from dreamer_jax.agent import Agent
 from experiments.meta_modules import meta_dynamics, meta_head
 from transfer import recipes
+from transfer_trees import bits
 
 AGENTS = {
     "continuous": {},

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from transfer_trees import LIBRARIES, library_tree, trees
 
 import transfer
 from transfer.select import match, match_paths, selected
+from transfer_trees import LIBRARIES, library_tree, trees
 
 AGENT = {
     "dynamics": {

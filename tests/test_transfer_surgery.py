@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from flax import nnx
 from hypothesis import strategies as st
+
+import transfer
 from transfer_trees import (
     LIBRARIES,
     assert_same_kind,
@@ -20,8 +22,6 @@ from transfer_trees import (
     on_device,
     trees,
 )
-
-import transfer
 
 many = hypothesis.settings(max_examples=50, deadline=None)
 few = hypothesis.settings(max_examples=10, deadline=None)  # of what compiles for every example
