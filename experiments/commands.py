@@ -130,11 +130,14 @@ class Classify:
 class Report:
     """Print the table of a results folder and draw its learning curves.
 
-    Of a folder of all results of a preset (results/cpu): write all tables, figures and the page.
+    Of several folders: of all of them beside each other. Of a folder of all results of a preset
+    (results/cpu): write all tables, figures and the page.
     """
 
-    directory: tyro.conf.Positional[Path]
-    """The results folder."""
+    directories: tyro.conf.Positional[tuple[Path, ...]]
+    """The results folder, or several."""
+    out: Path = Path("comparison.png")
+    """Of several folders: the picture to draw; an .svg is written beside it."""
     seeds: tuple[int, ...] = SEEDS
     """Of all results: the seeds that tables and figures show."""
     backend: Backend = "bullet"
@@ -171,16 +174,24 @@ def train(command: Train) -> int:
     if carry_out(run) == "stopped":
         print(f"stopped and saved in {command.out}: the same command with --resume continues")
         return STOPPED
-    return report(Report(command.out))
+    return report(Report((command.out,)))
 
 
 def report(command: Report) -> int:
-    """Shows a run, or all results under a folder."""
+    """Shows a run, several beside each other, or all results under a folder."""
     from experiments import report
     from experiments.grid_commands import report_all
     from experiments.results import run_folders
 
-    directory = command.directory
+    if not command.directories:
+        raise UsageError("nothing to report: name a results folder, or several")
+    if len(command.directories) > 1:
+        with usage_errors():
+            print(report.table(report.compare(command.directories)))
+            picture, _ = report.plot_comparison(command.directories, command.out)
+        print(f"learning curves: {picture}")
+        return 0
+    (directory,) = command.directories
     if not (directory / "run.json").exists() and run_folders(directory):
         return report_all(directory, command.seeds, command.backend)
     with usage_errors():

@@ -7,8 +7,8 @@ all these returns, of all seeds together, as in the thesis (see `statistics.mean
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +121,99 @@ def table(summaries: Sequence[Summary]) -> str:
     return aligned(["", "overall", "final", "seeds", "evaluations"], rows)
 
 
+@dataclass(frozen=True)
+class Curve:
+    """One line of a picture.
+
+    Attributes:
+      text: what the legend calls it.
+      rows: its evaluations, of all seeds.
+      style: keywords of matplotlib's `plot`.
+    """
+
+    text: str
+    rows: Sequence[dict[str, Any]]
+    style: Mapping[str, Any]
+
+
+def _curves(directory: str | Path, prefix: str = "") -> dict[str, list[Curve]]:
+    """The curves of a results folder by task, those of one label alike; without colours.
+
+    Raises:
+      ValueError: the folder holds no run, or nothing has been evaluated yet.
+    """
+    spec, rows = read_spec(directory), evaluations(directory)
+    if not rows:
+        raise ValueError(f"{directory} has no evaluations to draw yet")
+    names, found = labels(spec), {}
+    for task in spec.tasks:
+        found[task] = []
+        for name in names:
+            chosen = [row for row in rows if row["label"] == name and row["task"] == task]
+            words = [prefix] * bool(prefix)
+            words += [re.sub(r"^omega=", "ω = ", name)] * (len(names) > 1 or not prefix)
+            style = {"linestyle": "--"} if name == BASELINE and len(names) > 1 else {}
+            found[task].append(Curve(" ".join(words), chosen, style))
+    return found
+
+
+def _draw(panels: Mapping[str, Sequence[Curve]], stem: Path) -> list[Path]:
+    """Draws panels side by side: mean and standard deviation over seeds against time.
+
+    Returns:
+      The files written, PNG and SVG.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    columns = len(panels)
+    figure, axes = pyplot.subplots(
+        1, columns, figsize=(6.4 * columns, 4.2), squeeze=False, layout="constrained"
+    )
+    for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
+        for curve in curves:
+            steps = sorted({row["env_steps"] for row in curve.rows})
+            returns = [[r["return"] for r in curve.rows if r["env_steps"] == x] for x in steps]
+            mean = np.array([np.mean(values) for values in returns])
+            deviation = np.array([np.std(values) for values in returns])
+            axis.plot(steps, mean, label=curve.text, marker="o", markersize=3, **curve.style)
+            axis.fill_between(
+                steps,
+                mean - deviation,
+                mean + deviation,
+                color=curve.style["color"],
+                alpha=0.15,
+                lw=0,
+            )
+        axis.set_title(title)
+        axis.set_xlabel("environment steps")
+        axis.set_ylabel("return of an evaluation episode")
+        axis.grid(alpha=0.3)
+        if len(curves) > 1:
+            axis.legend(frameon=False)
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    paths = [stem.with_suffix(suffix) for suffix in (".png", ".svg")]
+    for file in paths:
+        figure.savefig(file, dpi=150)
+    pyplot.close(figure)
+    return paths
+
+
+def _coloured(curves: Sequence[Curve], baseline: str | None = None) -> list[Curve]:
+    """The curves in the colours of a scale, dashed ones in `baseline` if it is given."""
+    from matplotlib import colormaps
+
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, max(1, len(curves))))
+    return [
+        replace(
+            curve, style={"color": baseline if curve.style and baseline else shade} | curve.style
+        )
+        for curve, shade in zip(curves, shades, strict=True)
+    ]
+
+
 def plot_curves(directory: str | Path, path: str | Path | None = None) -> list[Path]:
     """Draws the learning curves: mean and standard deviation over seeds, one line per label.
 
@@ -134,44 +227,55 @@ def plot_curves(directory: str | Path, path: str | Path | None = None) -> list[P
     Raises:
       ValueError: nothing has been evaluated yet.
     """
-    import matplotlib
+    found = _curves(directory)
+    called = titles(found)
+    panels = {called[task]: _coloured(curves, "black") for task, curves in found.items()}
+    return _draw(panels, Path(path) if path is not None else Path(directory) / "curves")
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
 
-    directory = Path(directory)
-    spec, rows = read_spec(directory), evaluations(directory)
-    if not rows:
-        raise ValueError(f"{directory} has no evaluations to draw yet")
-    stem = Path(path) if path is not None else directory / "curves"
-    columns = len(spec.tasks)
-    figure, axes = pyplot.subplots(
-        1, columns, figsize=(6.4 * columns, 4.2), squeeze=False, layout="constrained"
-    )
-    names, called = labels(spec), titles(spec.tasks)
-    shades = pyplot.get_cmap("viridis")(np.linspace(0.0, 0.85, max(1, len(names))))
-    for axis, task in zip(axes[0], spec.tasks, strict=True):
-        for name, shade in zip(names, shades, strict=True):
-            chosen = [row for row in rows if row["label"] == name and row["task"] == task]
-            steps = sorted({row["env_steps"] for row in chosen})
-            returns = [[r["return"] for r in chosen if r["env_steps"] == step] for step in steps]
-            mean = np.array([np.mean(values) for values in returns])
-            deviation = np.array([np.std(values) for values in returns])
-            baseline = name == BASELINE and len(names) > 1
-            text = re.sub(r"^omega=", "ω = ", name)
-            style = {"color": "black", "linestyle": "--"} if baseline else {"color": shade}
-            axis.plot(steps, mean, label=text, marker="o", markersize=3, **style)
-            axis.fill_between(
-                steps, mean - deviation, mean + deviation, color=style["color"], alpha=0.15, lw=0
-            )
-        axis.set_title(called[task])
-        axis.set_xlabel("environment steps")
-        axis.set_ylabel("return of an evaluation episode")
-        axis.grid(alpha=0.3)
-        if len(names) > 1:
-            axis.legend(frameon=False)
-    paths = [stem.with_suffix(suffix) for suffix in (".png", ".svg")]
-    for file in paths:
-        figure.savefig(file, dpi=150)
-    pyplot.close(figure)
-    return paths
+def folder_names(directories: Sequence[Path]) -> list[str]:
+    """What each of some folders is called: its name, or its path where others have the same."""
+    count = Counter(directory.resolve().name for directory in directories)
+    return [
+        directory.resolve().name if count[directory.resolve().name] == 1 else str(directory)
+        for directory in directories
+    ]
+
+
+def compare(directories: Sequence[Path]) -> list[Summary]:
+    """One summary per folder, label and task; labels begin with the folder's name."""
+    summaries = []
+    for name, directory in zip(folder_names(directories), directories, strict=True):
+        found = summarise(directory)
+        several = len({summary.label for summary in found}) > 1
+        summaries += [
+            replace(summary, label=f"{name} {summary.label}" if several else name)
+            for summary in found
+        ]
+    return summaries
+
+
+def plot_comparison(directories: Sequence[Path], path: str | Path) -> list[Path]:
+    """Draws the learning curves of several folders at equal environment steps: a panel for each
+    of the tasks' titles, whichever the simulator, and a line per folder and label.
+
+    Args:
+      directories: results folders.
+      path: where to, without suffix.
+
+    Returns:
+      The files written, PNG and SVG.
+
+    Raises:
+      ValueError: a folder holds no run, or nothing has been evaluated in it yet.
+    """
+    panels: dict[str, list[Curve]] = {}
+    for name, directory in zip(folder_names(directories), directories, strict=True):
+        found = _curves(directory, name)
+        called = titles(found)
+        for task, curves in found.items():
+            title = envs.spec(task).title
+            if called[task] != title:
+                curves = [replace(curve, text=f"{curve.text} {task}") for curve in curves]
+            panels.setdefault(title, []).extend(curves)
+    return _draw({title: _coloured(curves) for title, curves in panels.items()}, Path(path))
