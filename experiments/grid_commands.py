@@ -224,6 +224,8 @@ def plan(command: Plan) -> int:
 
 def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     """Trains what is missing and writes tables and figures."""
+    from rich.progress import Progress
+
     from experiments.latent_tables import make_table
 
     runs, progress = _carry_out(entries, sweep)
@@ -238,7 +240,18 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
             progress.skipped[entry.name] = f"it needs {name}"
             continue
         try:
-            make_table(sweep.root, entry, sweep.seeds[0], workers=sweep.workers)
+            with Progress() as bar:
+                job = bar.add_task("gathering", visible=False)
+                make_table(
+                    sweep.root,
+                    entry,
+                    sweep.seeds[0],
+                    workers=sweep.workers,
+                    say=bar.console.print,
+                    report=lambda done, rounds, bar=bar, job=job: bar.update(
+                        job, completed=done, total=rounds, visible=True
+                    ),
+                )
         except ValueError as error:
             progress.failed[entry.name] = str(error)
     _write(entries, sweep.root, sweep.seeds, sweep.backend)

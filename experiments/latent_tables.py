@@ -7,6 +7,7 @@ accuracies and a picture.
 Axis letters: S samples, M latent feature size.
 """
 
+import itertools
 import os
 import zipfile
 from collections.abc import Callable, Mapping
@@ -36,6 +37,7 @@ def make_table(
     *,
     workers: int | None = None,
     say: Callable[[str], Any] = print,
+    report: Callable[[int, int], Any] = lambda done, rounds: None,
 ) -> Path:
     """Tells the tasks of a table's latent states; gathers them first if nobody has.
 
@@ -45,6 +47,7 @@ def make_table(
       seed: of the agent, and of episodes and samples.
       workers: simulator processes; by default one per core.
       say: where messages go.
+      report: called after each round of gathering, with how many are done and how many there are.
 
     Returns:
       The file of accuracies, which `results.read_classification` reads.
@@ -59,7 +62,7 @@ def make_table(
     names = {title: task_name(table.backend, title) for title in TASKS}
     if not (folder / "samples.npz").exists():
         say(f"latent states of {len(names)} tasks: {folder}")
-        drawn = _gather(root, table.backend, tuple(names.values()), seed, workers)
+        drawn = _gather(root, table.backend, tuple(names.values()), seed, workers, report)
         _write(folder / "samples.npz", drawn)
     drawn = _read(folder / "samples.npz", tuple(names.values()))
     tasks = tuple(names[title] for title in (*table.targets, *table.known))
@@ -72,14 +75,27 @@ def make_table(
 
 
 def _gather(
-    root: str | Path, backend: Backend, tasks: tuple[str, ...], seed: int, workers: int | None
+    root: str | Path,
+    backend: Backend,
+    tasks: tuple[str, ...],
+    seed: int,
+    workers: int | None,
+    report: Callable[[int, int], Any],
 ) -> dict[str, tuple[Latents, Latents]]:
     cell = multitask(backend, AUTOENCODER, seed)
     places = folders(root)
     if cell.name not in places:
         raise ValueError(f"the agent {cell.name!r} is not trained yet: its table trains it first")
     source = load_source(*places[cell.name])
-    found = gather(source, tasks, classify.rounds(source, SAMPLES), seed=seed, workers=workers)
+    rounds, done = classify.rounds(source, SAMPLES), itertools.count(1)
+    found = gather(
+        source,
+        tasks,
+        rounds,
+        seed=seed,
+        workers=workers,
+        report=lambda: report(next(done), rounds),
+    )
     return {
         task: classify.draw(latents, SAMPLES, seed)
         for task, latents in zip(tasks, found, strict=True)
