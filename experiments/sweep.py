@@ -62,7 +62,11 @@ def train(run: PlannedRun, root: Path, workers: int | None) -> Literal["finished
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
         spec = in_memory(spec)
-    return carry_out(make_run(spec, folder, resume=True, workers=workers, base=root))
+    try:
+        return carry_out(make_run(spec, folder, resume=True, workers=workers, base=root))
+    finally:
+        # The programs of its simulators serve no other run, and take up to 100 MiB a task.
+        jax.clear_caches()
 
 
 def carry_out_runs(

@@ -3,12 +3,14 @@
 import dataclasses
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from envs import SimulatorError
 from experiments import estimate
+from experiments import sweep as sweeps
 from experiments.estimate import Speed, plan_table
 from experiments.graph import plan_runs
 from experiments.grid import TABLES, closure, shown
@@ -131,6 +133,15 @@ def test_two_sweeps_at_once_are_refused(tmp_path):
         return Trainer()(run, root, workers)
 
     assert carry_out_runs(plan(tmp_path), tmp_path, train=train, say=lambda _: None).complete
+
+
+def test_what_a_run_compiled_is_freed_after_it(tmp_path, monkeypatch):
+    compiled = jax.jit(lambda x: x + 1)
+    monkeypatch.setattr(sweeps, "make_run", lambda *_, **__: 1)
+    monkeypatch.setattr(sweeps, "carry_out", lambda run: compiled(run) and "finished")
+    source, *_ = plan(tmp_path)
+    assert sweeps.train(source, tmp_path, None) == "finished"
+    assert compiled._cache_size() == 0
 
 
 # --- what it will take ------------------------------------------------------------------------
