@@ -153,7 +153,7 @@ def _curves(directory: str | Path, prefix: str = "") -> dict[str, list[Curve]]:
             words = [prefix] * bool(prefix)
             words += [re.sub(r"^omega=", "ω = ", name)] * (len(names) > 1 or not prefix)
             style = {"linestyle": "--"} if name == BASELINE and len(names) > 1 else {}
-            found[task].append(Curve(" ".join(words), chosen, style))
+            found[task].append(Curve(", ".join(words), chosen, style))
     return found
 
 
@@ -169,8 +169,10 @@ def _draw(panels: Mapping[str, Sequence[Curve]], stem: Path) -> list[Path]:
     from matplotlib import pyplot
 
     columns = len(panels)
+    # Legends of many lines stand beside the panels.
+    width = 9.0 if any(len(curves) > 4 for curves in panels.values()) else 6.4
     figure, axes = pyplot.subplots(
-        1, columns, figsize=(6.4 * columns, 4.2), squeeze=False, layout="constrained"
+        1, columns, figsize=(width * columns, 4.2), squeeze=False, layout="constrained"
     )
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         for curve in curves:
@@ -191,7 +193,9 @@ def _draw(panels: Mapping[str, Sequence[Curve]], stem: Path) -> list[Path]:
         axis.set_xlabel("environment steps")
         axis.set_ylabel("return of an evaluation episode")
         axis.grid(alpha=0.3)
-        if len(curves) > 1:
+        if len(curves) > 4:
+            axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
+        elif len(curves) > 1:
             axis.legend(frameon=False)
     stem.parent.mkdir(parents=True, exist_ok=True)
     paths = [stem.with_suffix(suffix) for suffix in (".png", ".svg")]
@@ -249,7 +253,7 @@ def compare(directories: Sequence[Path]) -> list[Summary]:
         found = summarise(directory)
         several = len({summary.label for summary in found}) > 1
         summaries += [
-            replace(summary, label=f"{name} {summary.label}" if several else name)
+            replace(summary, label=f"{name}, {summary.label}" if several else name)
             for summary in found
         ]
     return summaries
@@ -276,6 +280,6 @@ def plot_comparison(directories: Sequence[Path], path: str | Path) -> list[Path]
         for task, curves in found.items():
             title = envs.spec(task).title
             if called[task] != title:
-                curves = [replace(curve, text=f"{curve.text} {task}") for curve in curves]
+                curves = [replace(curve, text=f"{curve.text}, {task}") for curve in curves]
             panels.setdefault(title, []).extend(curves)
     return _draw({title: _coloured(curves) for title, curves in panels.items()}, Path(path))

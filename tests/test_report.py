@@ -68,8 +68,8 @@ def test_curves_are_told_apart_by_folder_label_and_simulator(folder, tmp_path, m
     report.plot_comparison([both, targets], "picture")
     a, b = map(str, (both, targets))
     assert panels == {
-        "Hopper": [f"{a} bullet/hopper", f"{a} brax/hopper"],
-        "Ant": [a, f"{b} ω = 0", f"{b} ω = 0.2", f"{b} baseline"],
+        "Hopper": [f"{a}, bullet/hopper", f"{a}, brax/hopper"],
+        "Ant": [a, f"{b}, ω = 0", f"{b}, ω = 0.2", f"{b}, baseline"],
     }
 
 
