@@ -136,7 +136,7 @@ def _title(table: Table) -> str:
 def _common_notes(table: Table, size: str | None) -> list[str]:
     notes = [] if size is None else [f"Ours are of {size} with the published numbers."]
     if table.backend != "bullet":
-        notes.append(f"Ours are on {table.backend}, the published ones on PyBullet: other tasks.")
+        notes.append("Ours are on Brax, the published ones on PyBullet: other tasks.")
     return notes
 
 

@@ -514,7 +514,7 @@ def test_tables_of_both_simulators_stand_beside_one_another(root, drawn):
         ("report-brax", "4 of 8 evaluations", "Brax"),
     ]:
         text = (root / folder / "table-7.txt").read_text(encoding="utf-8")
-        assert baseline in text and ("Ours are on brax" in text) == (simulator == "Brax")
+        assert baseline in text and ("Ours are on Brax" in text) == (simulator == "Brax")
         assert f"{simulator}, seeds 0, 1" in (root / folder / "index.html").read_text("utf-8")
 
 
