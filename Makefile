@@ -57,7 +57,7 @@ figures: $(STAMP)$(BACKEND)  ## Make all figures
 plan: $(STAMP)$(BACKEND)  ## Show the runs behind TABLE and FIGURE (numbers, or all) and what they will take
 	$(RUN) -m experiments plan $(if $(TABLE),--table $(TABLE)) $(if $(FIGURE),--figure $(FIGURE)) $(GRID) $(ARGS)
 
-test: $(STAMP)bullet+brax+gymnasium+dev  ## Run the test suite (20 minutes)
+test: $(STAMP)bullet+brax+gymnasium+dev  ## Run the test suite (15 minutes)
 	$(RUN) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
 
 lint: $(STAMP)bullet+brax+gymnasium+dev  ## Check the style
