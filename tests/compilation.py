@@ -1,9 +1,13 @@
 """Quick code for tests that run it for long; the others compile quickly instead (conftest.py)."""
 
+import os
+
 from dreamer_jax import training
 
-QUICK_CODE = {"xla_backend_optimization_level": 2, "xla_cpu_use_fusion_emitters": True}
+QUICK_CODE = {"xla_backend_optimization_level": 2}
 """Options of `jax.jit` and of `compile`."""
+if "xla_cpu_use_fusion_emitters" in os.environ["XLA_FLAGS"]:
+    QUICK_CODE["xla_cpu_use_fusion_emitters"] = True
 
 
 def update_with_quick_code(monkeypatch):

@@ -1,6 +1,7 @@
 """Settings of JAX for tests and the processes they start, made before JAX is imported anywhere."""
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 # Compiled functions are kept on disk, so that tests and their subprocesses share them.
@@ -9,10 +10,8 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 # What tests compile runs for milliseconds: quick compilation matters more than quick code.
-os.environ["XLA_FLAGS"] = " ".join(
-    [
-        os.environ.get("XLA_FLAGS", ""),
-        "--xla_backend_optimization_level=0",
-        "--xla_cpu_use_fusion_emitters=false",
-    ]
-).strip()
+_flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
+# Later versions do not know this flag, and end the process that sets it.
+if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
+    _flags.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join(_flags).strip()
