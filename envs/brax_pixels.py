@@ -59,7 +59,7 @@ _SHORT_STEPS = ("spring", "positional")
 
 # Newtons with which an action of 1 pushes the cart: of the pendulum what its model's motor has, of
 # the double pendulum what PyBullet's has, for its model's 500 would drive it into the ends of the
-# rail faster than the engines can follow.
+# rail faster than "generalized" and "mjx" can follow.
 _PUSH = {"InvertedPendulum": 300.0, "InvertedDoublePendulum": 200.0}
 _SWINGUP_SECONDS = 0.0165
 
