@@ -287,7 +287,7 @@ class Run:
         self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
-    def _collect(self, mode: Mode) -> None:
+    def _collect(self, mode: Literal["random", "explore"]) -> None:
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
         rounds = self.counters.rounds
         records = self._phase(mode, rounds)

@@ -61,7 +61,6 @@ _SHORT_STEPS = ("spring", "positional")
 # the double pendulum what PyBullet's has, for its model's 500 would drive it into the ends of the
 # rail faster than "generalized" and "mjx" can follow.
 _PUSH = {"InvertedPendulum": 300.0, "InvertedDoublePendulum": 200.0}
-_SWINGUP_SECONDS = 0.0165
 
 
 @contextlib.contextmanager
@@ -77,9 +76,9 @@ class _Swingup(PipelineEnv):
 
     def __init__(self, title: str, backend: str, n_frames: int):
         system = mjcf.loads(model_xml(title))
-        # Steps of the models' own 10 and 20 ms gain energy when the cart meets an end of the rail,
-        # until nothing is finite.
-        system = system.tree_replace({"opt.timestep": _SWINGUP_SECONDS / n_frames})
+        # PyBullet's time step. Physics steps of the models' own 10 and 20 ms gain energy when the
+        # cart meets an end of the rail, until nothing is finite.
+        system = system.tree_replace({"opt.timestep": TaskSpec.step_seconds / n_frames})
         self._push = _PUSH[title] / system.actuator.gear
         super().__init__(system, backend=backend, n_frames=n_frames)
 

@@ -247,7 +247,6 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
                     entry,
                     sweep.seeds[0],
                     workers=sweep.workers,
-                    say=bar.console.print,
                     report=lambda done, rounds, bar=bar, job=job: bar.update(
                         job, completed=done, total=rounds, visible=True
                     ),

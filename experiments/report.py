@@ -136,8 +136,18 @@ class Curve:
     style: Mapping[str, Any]
 
 
-def _curves(directory: str | Path, prefix: str = "") -> dict[str, list[Curve]]:
-    """The curves of a results folder by task, those of one label alike; without colours.
+def _of_folder(name: str, label: str, several: bool) -> str:
+    """What a label of a folder is called beside other folders': by the folder's name alone, unless
+    it has several labels."""
+    return f"{name}, {label}" if several else name
+
+
+def _curves(directory: str | Path, name: str | None = None) -> dict[str, list[Curve]]:
+    """The curves of a results folder by task, without colours.
+
+    Args:
+      directory: a results folder.
+      name: what the folder is called, where others are drawn with it.
 
     Raises:
       ValueError: the folder holds no run, or nothing has been evaluated yet.
@@ -145,15 +155,15 @@ def _curves(directory: str | Path, prefix: str = "") -> dict[str, list[Curve]]:
     spec, rows = read_spec(directory), evaluations(directory)
     if not rows:
         raise ValueError(f"{directory} has no evaluations to draw yet")
-    names, found = labels(spec), {}
+    several, found = len(labels(spec)) > 1, {}
     for task in spec.tasks:
         found[task] = []
-        for name in names:
-            chosen = [row for row in rows if row["label"] == name and row["task"] == task]
-            words = [prefix] * bool(prefix)
-            words += [re.sub(r"^omega=", "ω = ", name)] * (len(names) > 1 or not prefix)
-            style = {"linestyle": "--"} if name == BASELINE and len(names) > 1 else {}
-            found[task].append(Curve(", ".join(words), chosen, style))
+        for label in labels(spec):
+            chosen = [row for row in rows if row["label"] == label and row["task"] == task]
+            text = re.sub(r"^omega=", "ω = ", label)
+            text = text if name is None else _of_folder(name, text, several)
+            style = {"linestyle": "--"} if label == BASELINE and several else {}
+            found[task].append(Curve(text, chosen, style))
     return found
 
 
@@ -239,10 +249,11 @@ def plot_curves(directory: str | Path, path: str | Path | None = None) -> list[P
 
 def folder_names(directories: Sequence[Path]) -> list[str]:
     """What each of some folders is called: its name, or its path where others have the same."""
-    count = Counter(directory.resolve().name for directory in directories)
+    names = [directory.resolve().name for directory in directories]
+    count = Counter(names)
     return [
-        directory.resolve().name if count[directory.resolve().name] == 1 else str(directory)
-        for directory in directories
+        name if count[name] == 1 else str(directory)
+        for name, directory in zip(names, directories, strict=True)
     ]
 
 
@@ -253,8 +264,7 @@ def compare(directories: Sequence[Path]) -> list[Summary]:
         found = summarise(directory)
         several = len({summary.label for summary in found}) > 1
         summaries += [
-            replace(summary, label=f"{name}, {summary.label}" if several else name)
-            for summary in found
+            replace(summary, label=_of_folder(name, summary.label, several)) for summary in found
         ]
     return summaries
 
