@@ -38,10 +38,12 @@ class Carry(NamedTuple):
     Attributes:
       state: the latent state.
       action: float32 [A], the action taken in it.
+      random: float32 [A], the random action or noise that is held.
     """
 
     state: rssm.LatentState
     action: jax.Array
+    random: jax.Array
 
 
 @flax.struct.dataclass
@@ -85,6 +87,9 @@ class Batch(NamedTuple):
 # Salts that keep the streams of random numbers of one seed apart.
 _INIT, _UPDATE = 0, 1
 
+# Set apart from a key's other use: whether what was drawn from it takes the place of what is held.
+_HOLD = 1
+
 
 def member_key(seed: jax.Array | int, purpose: int) -> jax.Array:
     """The key of a member for one purpose; members with one seed share it."""
@@ -114,12 +119,6 @@ class Agent:
     action_size: int
     discrete: bool = False
     modules: tuple[tuple[str, nn.Module], ...] = ()
-
-    def __post_init__(self):
-        if self.config.learning.entropy_scale and not self.discrete:
-            raise ValueError(
-                "entropy_scale is for discrete actions, and these are continuous: leave it at 0"
-            )
 
     @functools.cached_property
     def dtype(self):
@@ -288,7 +287,8 @@ class Agent:
 
     def initial_carry(self) -> Carry:
         """The policy's memory before an episode."""
-        return Carry(self.dynamics.initial(), jnp.zeros(self.action_size))
+        nothing = jnp.zeros(self.action_size)
+        return Carry(self.dynamics.initial(), nothing, nothing)
 
     def policy(
         self,
@@ -321,7 +321,8 @@ class Agent:
             mode = MODES.index(mode)
 
         def at_random() -> tuple[jax.Array, Carry]:
-            return self.random_action(key), carry
+            action = self._held(self.random_action(key), carry.random, first, key)
+            return action, carry._replace(random=action)
 
         def by_actor() -> tuple[jax.Array, Carry]:
             latent_key, action_key, explore_key = jax.random.split(key, 3)
@@ -334,14 +335,15 @@ class Agent:
             )
             outputs = self.head(params, "actor", state.features)
 
-            def explored() -> jax.Array:
-                action = self.sample(outputs, self.action_noise(action_key, ()))
-                return self._explore(action, explore_key, updates)
+            def evaluated() -> tuple[jax.Array, jax.Array]:
+                return self._mode(outputs, action_key), carry.random
 
-            action = _one_of(
-                mode == MODES.index("evaluate"), lambda: self._mode(outputs, action_key), explored
-            )
-            return action, Carry(state, action)
+            def explored() -> tuple[jax.Array, jax.Array]:
+                action = self.sample(outputs, self.action_noise(action_key, ()))
+                return self._explore(action, carry.random, first, explore_key, updates)
+
+            action, random = _one_of(mode == MODES.index("evaluate"), evaluated, explored)
+            return action, Carry(state, action, random)
 
         return _one_of(mode == MODES.index("random"), at_random, by_actor)
 
@@ -366,19 +368,39 @@ class Agent:
     def _mode(self, outputs: jax.Array, key: jax.Array) -> jax.Array:
         if self.discrete:
             return jax.nn.one_hot(jnp.argmax(outputs, -1), self.action_size)
+        if self.config.exploration.evaluation_action == "mean":
+            return jnp.tanh(networks.tanh_normal(outputs)[0])
         return networks.tanh_normal_mode(outputs, key)
 
-    def _explore(self, action: jax.Array, key: jax.Array, updates: jax.Array | int) -> jax.Array:
+    def _held(self, fresh: jax.Array, held: jax.Array, first: jax.Array, key: jax.Array):
+        """What was drawn before, or `fresh` as often as the mean time of holding says."""
+        hold = self.config.exploration.exploration_hold
+        if hold == 1:
+            return fresh
+        changes = jax.random.uniform(jax.random.fold_in(key, _HOLD)) < 1 / hold
+        return jnp.where(first | changes, fresh, held)
+
+    def _explore(
+        self,
+        action: jax.Array,
+        held: jax.Array,
+        first: jax.Array,
+        key: jax.Array,
+        updates: jax.Array | int,
+    ) -> tuple[jax.Array, jax.Array]:
+        """The action with what explores, and what is held of that."""
         exploration = self.config.exploration
         if not self.discrete and exploration.exploration_kind == "gaussian":
-            noise = exploration.exploration_noise * jax.random.normal(key, action.shape)
-            return jnp.clip(action + noise, -1.0, 1.0)
+            noise = self._held(jax.random.normal(key, action.shape), held, first, key)
+            explored = action + exploration.exploration_noise * noise
+            return jnp.clip(explored, -1.0, 1.0), noise
         schedule = optax.linear_schedule(
             exploration.epsilon_start, exploration.epsilon_end, exploration.epsilon_decay
         )
         choice_key, action_key = jax.random.split(key)
         explores = jax.random.uniform(choice_key) < schedule(updates)
-        return jnp.where(explores, self.random_action(action_key), action)
+        random = self._held(self.random_action(action_key), held, first, key)
+        return jnp.where(explores, random, action), random
 
     # Learning.
 
@@ -412,11 +434,14 @@ class Agent:
             for name in ("actor", "value")
         }
         metrics |= behaviour_metrics
-        metrics |= {
-            f"{name}_gradient_norm": optax.tree.norm(gradient)
-            for name, gradient in gradients.items()
-            if gradient
-        }
+        for name, gradient in gradients.items():
+            if gradient:
+                norm = optax.tree.norm(gradient)
+                clipped = norm > self.config.learning.gradient_norm
+                metrics |= {
+                    f"{name}_gradient_norm": norm,
+                    f"{name}_gradient_clipped": clipped.astype(jnp.float32),
+                }
 
         optimisers, new_params = {}, dict(params)
         for name, gradient in gradients.items():

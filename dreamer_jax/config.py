@@ -81,6 +81,11 @@ class LearningConfig:
     """Floor of the mean KL divergence between posterior and prior, in nats."""
     kl_scale: float = 1.0
     """Weight of the KL divergence in the model's loss."""
+    image_std: float = 1.0
+    """Standard deviation of the image's Gaussian likelihood, in units of the pixel range. The
+    image loss is divided by its square: 0.5 at 32 x 32 pixels weighs a picture as 64 x 64 does."""
+    reward_std: float = 1.0
+    """Standard deviation of the reward's Gaussian likelihood, in rewards."""
     termination_scale: float = 10.0
     """Weight of the termination head in the model's loss."""
     model_learning_rate: float = 6e-4
@@ -90,8 +95,8 @@ class LearningConfig:
     actor_learning_rate: float = 8e-5
     """Adam's step size for the actor."""
     entropy_scale: float = 0.0
-    """Weight of the policy's entropy in the actor's loss, in rewards per nat (discrete actions
-    only; the thesis has none). It keeps an actor from settling on one action early."""
+    """Weight of the policy's entropy in the actor's loss, in rewards per nat (the thesis has
+    none). It keeps an actor from settling on one action early."""
     gradient_norm: float = 100.0
     """Largest norm of the gradient of each of the three groups; larger ones are scaled down."""
     adam_epsilon: float = 1e-7
@@ -123,6 +128,12 @@ class ExplorationConfig:
     """Gaussian noise (continuous actions) or epsilon-greedy (always used if discrete)."""
     exploration_noise: float = 0.3
     """Standard deviation of the Gaussian noise, in units of the action range [-1, 1]."""
+    exploration_hold: float = 1.0
+    """Agent steps for which random actions and Gaussian noise are held, on average: how long is
+    geometrically distributed. 1 draws them anew at every step, as the thesis does."""
+    evaluation_action: Literal["mode", "mean"] = "mode"
+    """What is played in evaluation, of continuous actions: the most likely of 100 samples, or the
+    tanh of the Gaussian's mean."""
     epsilon_start: float = 0.4
     """Probability of a random action before the first update."""
     epsilon_end: float = 0.1
@@ -141,6 +152,8 @@ class ScheduleConfig:
     """Environment steps of one task in a phase."""
     action_repeat: int = 2
     """Environment steps for which an action is repeated."""
+    supersample: int = 1
+    """Pictures are drawn this many times as large, and averaged down to the agent's size."""
     prefill_phases: int = 5
     """Phases of random actions before the first update (several tasks: 1 phase of each)."""
     updates_per_phase: int = 100

@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
-from dreamer_jax import losses, rssm
+from dreamer_jax import losses, networks, rssm
 from dreamer_jax.convolutions import arrange, image_distance
 
 if TYPE_CHECKING:
     from dreamer_jax.agent import Agent, Batch, Params
+
+
+SATURATED = 0.95
+"""Size of a continuous action beyond which the tanh lets less than a tenth of a gradient pass."""
 
 
 def joined(params: Params, trainable: Params) -> Params:
@@ -45,9 +49,17 @@ def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, ke
     image_loss = image_distance(agent.decode(params, features), batch.image).mean()
     reward_loss = losses.unit_gaussian_loss(agent.reward(params, features), batch.reward)
     kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
-    loss = image_loss + reward_loss
+    loss = image_loss / config.image_std**2 + reward_loss / config.reward_std**2
     loss += config.kl_scale * losses.floored_kl(kl, config.free_nats)
-    metrics = {"image_loss": image_loss, "reward_loss": reward_loss, "kl": kl.mean()}
+    mean_kl = kl.mean()
+    metrics = {
+        "image_loss": image_loss,
+        "reward_loss": reward_loss,
+        "kl": mean_kl,
+        "kl_at_start": kl[:, 0].mean(),
+        "kl_share_below_floor": (kl < config.free_nats).mean(),
+        "kl_floored": (mean_kl < config.free_nats).astype(jnp.float32),
+    }
     if "termination" in agent.heads:
         logits = agent.head(params, "termination", features)[..., 0]
         target = config.discount * (1.0 - batch.terminal)
@@ -116,13 +128,21 @@ def behaviour_loss(
         "imagined_reward": rewards.mean(),
         "imagined_value": values.mean(),
     }
+    # The states that the actor acted in: the start, and all but the last two.
+    acted_in = jnp.concatenate([start.features[None], features[:-2]])
+    outputs = agent.head(params, "actor", jax.lax.stop_gradient(acted_in))
+    if agent.discrete:
+        entropy = losses.categorical_entropy(outputs)
+    else:
+        mean, std = networks.tanh_normal(outputs)
+        before_tanh = mean + std * noise[:-1]
+        # An estimate from the actions that were taken; its gradient goes through them too.
+        entropy = -networks.tanh_normal_log_probability(outputs, before_tanh)
+        saturated = jnp.abs(jnp.tanh(before_tanh)) > SATURATED
+        metrics |= {"actor_std": std.mean(), "actor_saturation": saturated.mean()}
     if config.entropy_scale:
-        # The states that the actor acted in: the start, and all but the last two.
-        acted_in = jnp.concatenate([start.features[None], features[:-2]])
-        logits = agent.head(params, "actor", jax.lax.stop_gradient(acted_in))
-        entropy = losses.categorical_entropy(logits)
         actor_loss -= config.entropy_scale * (weights * entropy).mean()
-        metrics |= {"actor_loss": actor_loss, "actor_entropy": entropy.mean()}
+    metrics |= {"actor_loss": actor_loss, "actor_entropy": entropy.mean()}
     return actor_loss + value_loss, metrics
 
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from dreamer_jax.agent import Agent, AgentState, Batch, Mode
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
+from dreamer_jax.diagnosis import diagnose, warnings
 from dreamer_jax.logs import MetricsWriter
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Progress
@@ -156,6 +157,7 @@ class Run:
         self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
         self._restore()
         self._healthy = np.asarray(self.state.healthy)
+        self._warned: set[tuple[int, str]] = set()
 
     # The folder.
 
@@ -357,6 +359,7 @@ class Run:
                 **averages,
             }
             self.writer.write(row)
+            self._warn(member, averages)
         for member in np.flatnonzero(self._healthy & ~healthy):
             chosen = self.members[member]
             self._bar.message(
@@ -374,11 +377,25 @@ class Run:
                 "rates or the gradient norm. The last healthy parameters are in its checkpoint"
             )
 
+    def _warn(self, member: int, averages: Mapping[str, float]) -> None:
+        """Says once for each member what keeps it from learning."""
+        found = warnings(averages, self.agent.config.learning, self.counters.updates)
+        for name, message in found.items():
+            if (member, name) not in self._warned:
+                self._warned.add((member, name))
+                chosen = self.members[member]
+                self._bar.message(
+                    f"member {member} ({chosen.label}, seed {chosen.seed}), update "
+                    f"{self.counters.updates}: {message}"
+                )
+
     def _evaluate(self) -> None:
         """One episode per task and member: the mode, without noise, up to the first fall."""
         self._bar.update(phase="evaluating")
         index = self.counters.evaluations + 1
         records = self._phase("evaluate", index)
+        found = diagnose(self.agent, self.state.params, records, self.seeds, jnp.int32(index))
+        diagnosis = jax.device_get(found)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
             episode = episodes(Records(*(x[member, task] for x in records)))[0]
@@ -390,6 +407,7 @@ class Run:
                 "return": episode.score,
                 "length": episode.length,
                 "fell": episode.fell,
+                **{name: float(x[member, task]) for name, x in diagnosis.items()},
             }
             self.writer.write(row)
         evaluations = self.schedule.evaluations

@@ -29,6 +29,7 @@ class TaskSpec:
         step_seconds: simulated time of one environment step, in seconds.
         discrete: whether an action is one of |A| choices, given as a one-hot vector.
         physics: the physics engine, of a backend that has several.
+        supersample: pictures are drawn this many times as large, and averaged down.
     """
 
     name: str
@@ -41,6 +42,7 @@ class TaskSpec:
     step_seconds: float = 0.0165
     discrete: bool = False
     physics: str = ""
+    supersample: int = 1
 
 
 class TimeStep(NamedTuple):

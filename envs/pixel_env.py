@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import pkgutil
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from envs.base import TaskSpec
-from envs.wrappers import ActionRepeat, TimeLimit
+from envs.wrappers import ActionRepeat, TimeLimit, make_simulator
 
 
 class PixelEnv(gymnasium.Env):
@@ -55,10 +54,9 @@ class PixelEnv(gymnasium.Env):
         if seed is not None:
             self.close()
         if self._simulator is None:
-            simulator = pkgutil.resolve_name(self._task.simulator)
+            simulator = make_simulator(self._task, self._image_size)
             self._simulator = ActionRepeat(
-                TimeLimit(simulator(self._task.title, self._image_size), self._task.time_limit),
-                self._action_repeat,
+                TimeLimit(simulator, self._task.time_limit), self._action_repeat
             )
         self._simulator.reset(int(self.np_random.integers(2**63)))
         return self._simulator.render(), {}

@@ -129,6 +129,7 @@ def make(
     action_repeat: int = 2,
     workers: int | None = None,
     action_size: int | None = None,
+    supersample: int = 1,
 ) -> Env:
     """The environment of a population: P = `members` simulators of each of K = len(tasks) tasks.
 
@@ -139,6 +140,8 @@ def make(
         action_repeat: environment steps for which an action is held, at least 1.
         workers: number of simulator processes for each backend, by default min(cores, slots).
         action_size: A, the length of all actions; by default the largest |A| of the tasks.
+        supersample: pictures are drawn this many times as large and averaged down, which turns
+            the jumps of edges from pixel to pixel into shades; 1 draws them as they are.
 
     Raises:
         ValueError: for an unknown task or a number that is too small.
@@ -149,12 +152,18 @@ def make(
     known = specs(tasks)
     if not known:
         raise ValueError("got no tasks, expected at least one task")
-    numbers = dict(members=members, image_size=image_size, action_repeat=action_repeat)
+    numbers = dict(
+        members=members,
+        image_size=image_size,
+        action_repeat=action_repeat,
+        supersample=supersample,
+    )
     if workers is not None:
         numbers["workers"] = workers
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"got {name}={number}, expected at least 1")
+    known = tuple(replace(task, supersample=supersample) for task in known)
     largest = max(task.action_size for task in known)
     if action_size is not None and action_size < largest:
         raise ValueError(

@@ -10,7 +10,6 @@ import faulthandler
 import mmap
 import os
 import pickle
-import pkgutil
 import signal
 import time
 import traceback
@@ -23,7 +22,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 
 from envs.base import Simulator, TaskSpec, TimeStep
-from envs.wrappers import ActionPadding, ActionRepeat
+from envs.wrappers import ActionPadding, ActionRepeat, make_simulator
 
 # Seconds for which either end asks again for the other's message before it falls asleep.
 ACTIVE_WAIT = 0.003
@@ -130,7 +129,7 @@ def _serve(connection: Connection, phases: dict[int, Phase], records: np.ndarray
 
 
 def _make_simulator(task: TaskSpec, settings: WorkerSettings) -> Simulator:
-    simulator = pkgutil.resolve_name(task.simulator)(task.title, settings.image_size)
+    simulator = make_simulator(task, settings.image_size)
     return ActionPadding(ActionRepeat(simulator, settings.action_repeat), task.action_size)
 
 

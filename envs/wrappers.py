@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pkgutil
+
 import numpy as np
 
-from envs.base import Outcome, Simulator
+from envs.base import Outcome, Simulator, TaskSpec
 
 
 class SimulatorWrapper:
@@ -60,6 +62,35 @@ class TimeLimit(SimulatorWrapper):
         self._steps += 1
         outcome = super().step(action)
         return outcome._replace(truncated=outcome.truncated or self._steps >= self._limit)
+
+
+class Supersampling(SimulatorWrapper):
+    """Averages pictures that are drawn `factor` times as large, so that edges turn grey where
+    they would jump from pixel to pixel."""
+
+    def __init__(self, simulator: Simulator, factor: int):
+        super().__init__(simulator)
+        self._factor = factor
+
+    def render(self) -> np.ndarray:
+        return averaged(super().render(), self._factor)
+
+
+def averaged(image: np.ndarray, factor: int) -> np.ndarray:
+    """The mean of each `factor` x `factor` block of pixels, rounded half up:
+    uint8 [height * factor, width * factor, 3] -> uint8 [height, width, 3]."""
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    blocks = image.reshape(height, factor, width, factor, 3)
+    area = factor * factor
+    return ((blocks.sum(axis=(1, 3), dtype=np.uint32) + area // 2) // area).astype(np.uint8)
+
+
+def make_simulator(task: TaskSpec, image_size: int) -> Simulator:
+    """The simulator of a task, with pictures of that size."""
+    make = pkgutil.resolve_name(task.simulator)
+    if task.supersample == 1:
+        return make(task.title, image_size)
+    return Supersampling(make(task.title, image_size * task.supersample), task.supersample)
 
 
 class ActionPadding(SimulatorWrapper):

@@ -79,6 +79,7 @@ def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
         image_size=spec.config.network.image_size,
         action_repeat=spec.config.schedule.action_repeat,
         workers=workers,
+        supersample=spec.config.schedule.supersample,
     )
 
 

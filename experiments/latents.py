@@ -117,6 +117,7 @@ def gather(
         action_repeat=source.spec.config.schedule.action_repeat,
         workers=workers,
         action_size=acting.action_size,
+        supersample=source.spec.config.schedule.supersample,
     )
     key = jax.random.key(seed)
     found: list[list[Latents]] = [[] for _ in tasks]

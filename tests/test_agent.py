@@ -16,6 +16,7 @@ from dreamer_jax import networks, rssm
 from dreamer_jax.agent import MODES, Agent, Batch
 from dreamer_jax.config import preset
 from dreamer_jax.learning import behaviour_loss, model_loss
+from dreamer_jax.losses import gaussian_kl
 from dreamer_jax.population import map_members
 
 A = 2
@@ -370,9 +371,110 @@ def test_entropys_weight_pulls_an_actor_towards_even_odds():
     assert np.log(3) - entropies[-1] < 0.2 * (np.log(3) - entropies[0])
 
 
-def test_continuous_actions_have_no_weight_of_entropy():
-    with pytest.raises(ValueError, match="entropy_scale is for discrete actions"):
-        Agent(with_settings("learning", entropy_scale=0.1), 3)
+def test_entropys_weight_spreads_continuous_actions_over_their_range():
+    # A squashed Gaussian comes nearest to the uniform distribution, whose entropy is log 2 for
+    # each of the A actions, at a spread of about 0.9.
+    agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=1e-2), A)
+    state, batch, update = jax.jit(agent.init)(0), batch_of(), jax.jit(agent.update)
+    history = []
+    for _ in range(150):
+        state, metrics = update(state, batch)
+        history.append((metrics["actor_entropy"], metrics["actor_std"]))
+    (entropy, std), (last_entropy, last_std) = history[0], history[-1]
+    assert entropy < 0 and std > 3, "an actor begins with nearly all actions at their limits"
+    assert A * np.log(2) - 0.4 < last_entropy <= A * np.log(2) + 0.1
+    assert 0.6 < last_std < 1.3
+
+
+def test_the_entropys_gradient_goes_through_the_samples():
+    outputs, noise = jnp.array([[0.3, -1.2, 0.1, -4.0]]), jnp.array([[0.4, -0.7]])
+
+    def entropy(outputs):
+        mean, std = networks.tanh_normal(outputs)
+        return -networks.tanh_normal_log_probability(outputs, mean + std * noise).sum()
+
+    # -log p(tanh(mean + std * noise)) = log std + log(1 - tanh²) + constants of the noise.
+    def by_hand(outputs):
+        mean, std = networks.tanh_normal(outputs)
+        return (jnp.log(std) + jnp.log1p(-(jnp.tanh(mean + std * noise) ** 2))).sum()
+
+    assert_allclose(jax.grad(entropy)(outputs), jax.grad(by_hand)(outputs), rtol=1e-4)
+
+
+def test_the_images_spread_divides_its_loss_by_its_square():
+    batch, key = batch_of(), jax.random.key(1)
+    losses = {}
+    for std in (1.0, 0.5):
+        agent = Agent(with_settings("learning", image_std=std, reward_std=2 * std), A)
+        params = agent.init_params(jax.random.key(0))
+        loss, (_, metrics) = jax.jit(functools.partial(model_loss, agent, {}))(params, batch, key)
+        losses[std] = metrics
+        expected = metrics["image_loss"] / std**2 + metrics["reward_loss"] / (2 * std) ** 2 + 3.0
+        assert_allclose(loss, expected, rtol=1e-5)
+    assert losses[1.0]["image_loss"] == losses[0.5]["image_loss"]
+
+
+def test_the_divergence_of_first_records_is_told_apart(agent, state):
+    batch, key = batch_of(), jax.random.key(1)
+    _, (_, metrics) = jax.jit(functools.partial(model_loss, agent, {}))(state.params, batch, key)
+    posterior, mean, std = jax.jit(agent.observe)(state.params, batch, key)
+    kl = gaussian_kl(posterior.mean, posterior.std, mean, std)
+    assert_allclose(metrics["kl_at_start"], kl[:, 0].mean(), rtol=1e-4)
+    assert_allclose(metrics["kl_share_below_floor"], (kl < 3.0).mean())
+    assert metrics["kl_floored"] == (metrics["kl"] < 3.0)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_random_actions_are_held_as_long_as_told_on_average(discrete):
+    agent = Agent(with_settings("exploration", exploration_hold=8.0), 2, discrete)
+    image = batch_of().image[0, 0]
+
+    def tick(carry, inputs):
+        first, key = inputs
+        action, carry = agent.policy({}, carry, image, first, key, "random")
+        return carry, action
+
+    keys, first = jax.random.split(jax.random.key(0), 4000), jnp.arange(4000) == 0
+    actions = np.asarray(jax.lax.scan(tick, agent.initial_carry(), (first, keys))[1])
+    changes = (actions[1:] != actions[:-1]).any(axis=1)
+    # Half of the new choices among two are the old one.
+    assert_allclose(changes.mean(), 1 / 16 if discrete else 1 / 8, rtol=0.15)
+    if not discrete:
+        drawn = actions[1:][changes]
+        assert_allclose(drawn.std(), 1 / np.sqrt(3), rtol=0.1)
+
+
+def test_an_episodes_first_action_is_not_held_from_the_one_before():
+    agent = Agent(with_settings("exploration", exploration_hold=1e6), 2)
+    image = batch_of().image[0, 0]
+    carry = agent.initial_carry()._replace(random=jnp.array([0.25, -0.5]))
+    key = jax.random.key(0)
+    held, _ = agent.policy({}, carry, image, jnp.bool_(False), key, "random")
+    fresh, after = agent.policy({}, carry, image, jnp.bool_(True), key, "random")
+    assert_array_equal(held, [0.25, -0.5])
+    assert (fresh != held).all()
+    assert_array_equal(after.random, fresh)
+
+
+def test_held_noise_explores_around_the_actors_samples(agent, state):
+    held = Agent(with_settings("exploration", exploration_hold=1e6, exploration_noise=0.1), A)
+    quiet = Agent(with_settings("exploration", exploration_noise=0.0), A)
+    image, key = batch_of().image[0, 0], jax.random.key(3)
+    carry = held.initial_carry()._replace(random=jnp.array([1.0, -2.0]))
+    noisy, after = held.policy(state.params, carry, image, jnp.bool_(False), key, "explore")
+    plain, _ = quiet.policy(state.params, carry, image, jnp.bool_(False), key, "explore")
+    assert_allclose(noisy, jnp.clip(plain + jnp.array([0.1, -0.2]), -1, 1), atol=1e-6)
+    assert_array_equal(after.random, carry.random)
+
+
+def test_evaluation_can_play_the_tanh_of_the_mean(state):
+    agent = Agent(with_settings("exploration", evaluation_action="mean"), A)
+    image = batch_of().image[0, 0]
+    action, carry = agent.policy(
+        state.params, agent.initial_carry(), image, jnp.bool_(True), jax.random.key(0), "evaluate"
+    )
+    mean, _ = networks.tanh_normal(agent.head(state.params, "actor", carry.state.features))
+    assert_allclose(action, jnp.tanh(mean), atol=1e-6)
 
 
 def test_epsilon_greedy_falls_from_its_start_to_its_end():
@@ -382,7 +484,10 @@ def test_epsilon_greedy_falls_from_its_start_to_its_end():
     @jax.jit
     @jax.vmap
     def explored(key, updates):
-        return agent._explore(jnp.full(1, 0.123), key, updates)[0] != jnp.float32(0.123)
+        action, _ = agent._explore(
+            jnp.full(1, 0.123), jnp.zeros(1), jnp.bool_(False), key, updates
+        )
+        return action[0] != jnp.float32(0.123)
 
     keys = jax.random.split(jax.random.key(0), 4000)
     for updates, expected in ((0, 0.4), (50, 0.25), (100, 0.1), (10_000, 0.1)):
@@ -456,7 +561,7 @@ def test_a_mode_can_be_chosen_as_the_program_runs(agent, state):
         chex.assert_trees_all_close(
             (action, carry), jax.jit(act, static_argnums=0)(mode), atol=1e-5
         )
-        assert carry.action.any() != (mode == "random"), "who acts at random remembers nothing"
+        assert carry.action.any() != (mode == "random"), "who acts at random sees nothing"
         actions.append(action)
     assert len(np.unique(actions, axis=0)) == 3
 
