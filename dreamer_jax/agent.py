@@ -336,7 +336,7 @@ class Agent:
             outputs = self.head(params, "actor", state.features)
 
             def evaluated() -> tuple[jax.Array, jax.Array]:
-                return self._mode(outputs, action_key), carry.random
+                return self._mode(outputs, action_key), jnp.where(first, 0.0, carry.random)
 
             def explored() -> tuple[jax.Array, jax.Array]:
                 action = self.sample(outputs, self.action_noise(action_key, ()))
