@@ -51,7 +51,7 @@ def encoder_loss(layers, images, method):
     """Sum of squares of the features of images [B, height, width, 3]."""
     x = images.astype(jnp.float32) / 255 - 0.5
     for kernel, bias in layers:
-        x = jax.nn.relu(convolution(x, kernel, bias, method=method))
+        x = convolution(x, kernel, bias, relu=True, method=method)
     return jnp.square(x).sum()
 
 
@@ -60,7 +60,7 @@ def decoder_loss(arguments, images, method):
     layers, features = arguments
     x = features[:, None, None]
     for kernel, bias in layers[:-1]:
-        x = jax.nn.relu(transposed_convolution(x, kernel, bias, method=method))
+        x = transposed_convolution(x, kernel, bias, relu=True, method=method)
     x = transposed_convolution(x, *layers[-1], method=method)
     return jnp.square(x - (images.astype(jnp.float32) / 255 - 0.5)).sum()
 

@@ -62,7 +62,7 @@ class Dense(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution, or a transposed one, of stride 2 without padding.
+    """A convolution, or a transposed one, of stride 2 without padding, and a relu.
 
     The same two parameters serve every way of computing it (see dreamer_jax.convolutions).
     """
@@ -70,6 +70,7 @@ class Convolution(nn.Module):
     features: int
     kernel_size: int
     transposed: bool = False
+    relu: bool = True
     dtype: Dtype = jnp.float32
 
     @nn.compact
@@ -78,7 +79,8 @@ class Convolution(nn.Module):
         kernel = self.param("kernel", glorot_uniform, shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         apply = transposed_convolution if self.transposed else convolution
-        return apply(inputs.astype(self.dtype), kernel.astype(self.dtype), bias.astype(self.dtype))
+        arrays = (x.astype(self.dtype) for x in (inputs, kernel, bias))
+        return apply(*arrays, relu=self.relu)
 
 
 def encoder_layers(image_size: int) -> int:
@@ -100,7 +102,7 @@ class Encoder(nn.Module):
     def __call__(self, images: jax.Array) -> jax.Array:
         x = images
         for i in range(encoder_layers(self.image_size)):
-            x = nn.relu(Convolution(self.depth * 2**i, 4, dtype=self.dtype, name=f"conv_{i}")(x))
+            x = Convolution(self.depth * 2**i, 4, dtype=self.dtype, name=f"conv_{i}")(x)
         return x.reshape(*x.shape[:-3], -1)
 
 
@@ -125,9 +127,13 @@ class Decoder(nn.Module):
             last = i == layers - 1
             channels = 3 if last else self.depth * 2 ** (layers - 2 - i)
             x = Convolution(
-                channels, kernel, transposed=True, dtype=self.dtype, name=f"deconv_{i}"
+                channels,
+                kernel,
+                transposed=True,
+                relu=not last,
+                dtype=self.dtype,
+                name=f"deconv_{i}",
             )(x)
-            x = x if last else nn.relu(x)
         return x.astype(jnp.float32)
 
 

@@ -41,11 +41,11 @@ def draw(batch, height, width, k, inputs, outputs, seed=0):
     return tuple(jnp.asarray(each, jnp.float32) for each in (x, kernel, bias))
 
 
-def value_and_gradients(layer, method, x, kernel, bias):
+def value_and_gradients(layer, method, x, kernel, bias, relu=False):
     """The output, and the gradients of a loss that weighs every entry of it differently."""
 
     def loss(x, kernel, bias):
-        out = layer(x, kernel, bias, method=method)
+        out = layer(x, kernel, bias, relu=relu, method=method)
         weights = jnp.cos(jnp.arange(out.size, dtype=jnp.float32)).reshape(out.shape)
         return jnp.sum(weights * jnp.square(out)), out
 
@@ -83,16 +83,30 @@ def test_both_methods_agree_at_the_sizes_of_the_networks(layer, side, k, inputs,
     batch=st.lists(st.integers(1, 3), max_size=2),
     inputs=st.integers(1, 6),
     outputs=st.integers(1, 6),
+    relu=st.booleans(),
 )
-def test_both_methods_agree_at_any_size(transposed, k, excess, batch, inputs, outputs):
+def test_both_methods_agree_at_any_size(transposed, k, excess, batch, inputs, outputs, relu):
     layer = transposed_convolution if transposed else convolution
     smallest = 1 if transposed else k
     height, width = (smallest + each for each in excess)
     arguments = draw(batch, height, width, k, inputs, outputs)
     assert_same(
-        value_and_gradients(layer, "matmul", *arguments),
-        value_and_gradients(layer, "library", *arguments),
+        value_and_gradients(layer, "matmul", *arguments, relu),
+        value_and_gradients(layer, "library", *arguments, relu),
     )
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_layer_with_relu_is_the_layer_and_then_relu(layer, method):
+    arguments = draw((2,), 6, 7, 4, 3, 5)
+
+    def relu_after(*arguments, relu, method):
+        return jax.nn.relu(layer(*arguments, method=method))
+
+    desired = value_and_gradients(relu_after, method, *arguments)
+    assert 0.2 < (desired["out"] == 0).mean() < 0.8
+    assert_same(value_and_gradients(layer, method, *arguments, relu=True), desired)
 
 
 @pytest.mark.parametrize("method", METHODS)
