@@ -30,6 +30,7 @@ class TaskSpec:
         discrete: whether an action is one of |A| choices, given as a one-hot vector.
         physics: the physics engine, of a backend that has several.
         supersample: pictures are drawn this many times as large, and averaged down.
+        renderer: what draws the pictures, of a backend that has several renderers.
     """
 
     name: str
@@ -43,6 +44,7 @@ class TaskSpec:
     discrete: bool = False
     physics: str = ""
     supersample: int = 1
+    renderer: str = ""
 
 
 class TimeStep(NamedTuple):

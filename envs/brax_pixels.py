@@ -1,17 +1,13 @@
-"""The six Brax tasks: physics in the graph, pictures through one ordered host callback.
+"""The six Brax tasks as environments: physics in the graph, and pictures too unless MuJoCo draws.
 
 P population member, K tasks, A action, n rows of one batch, W words of a state, Q joint positions.
-Models and dynamics are those of the package `brax`, as are the rewards of locomotion; the two
-pendula are the swing-ups of the thesis (equations 24 and 25).
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
-import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -20,9 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Outcome, SimulatorError, TaskSpec, TimeStep
+from envs.brax_physics import physics_of, task_scene
 from envs.bridge import HostCalls
-from envs.mujoco_pictures import model_xml, pictures
 from envs.pool import SimulatorPool
+from envs.ray_casting import check_size, render
+from envs.registry import BRAX_ENGINES, BRAX_RENDERERS
 from envs.rows import (
     Layout,
     action_words,
@@ -31,133 +29,6 @@ from envs.rows import (
     key_words,
     mapped_rows,
 )
-
-# Brax says on import that `warp` is missing, which nothing here needs.
-with contextlib.redirect_stdout(io.StringIO()):
-    from brax.envs import get_environment
-    from brax.envs.base import PipelineEnv, State
-    from brax.io import mjcf
-
-_BRAX_NAMES = {
-    "Ant": "ant",
-    "HalfCheetah": "halfcheetah",
-    "Hopper": "hopper",
-    "Walker2D": "walker2d",
-}
-
-# Physics steps in an environment step, of the backends that integrate rigid bodies as MuJoCo does
-# ("generalized" and "mjx") and of those that need shorter steps ("spring" and "positional").
-_PHYSICS_STEPS = {
-    "Ant": (2, 4),
-    "HalfCheetah": (2, 6),
-    "Hopper": (8, 8),
-    "Walker2D": (8, 8),
-    "InvertedPendulum": (4, 4),
-    "InvertedDoublePendulum": (8, 8),
-}
-_SHORT_STEPS = ("spring", "positional")
-
-# Newtons with which an action of 1 pushes the cart: of the pendulum what its model's motor has, of
-# the double pendulum what PyBullet's has, for its model's 500 would drive it into the ends of the
-# rail faster than "generalized" and "mjx" can follow.
-_PUSH = {"InvertedPendulum": 300.0, "InvertedDoublePendulum": 200.0}
-
-
-@contextlib.contextmanager
-def _quiet():
-    """Keeps what Brax has to say of its age, and of MuJoCo's, to itself."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-class _Swingup(PipelineEnv):
-    """A pendulum on a cart, of one pole or two, that starts hanging and never ends."""
-
-    def __init__(self, title: str, backend: str, n_frames: int):
-        system = mjcf.loads(model_xml(title))
-        # PyBullet's time step. Physics steps of the models' own 10 and 20 ms gain energy when the
-        # cart meets an end of the rail, until nothing is finite.
-        system = system.tree_replace({"opt.timestep": TaskSpec.step_seconds / n_frames})
-        self._push = _PUSH[title] / system.actuator.gear
-        super().__init__(system, backend=backend, n_frames=n_frames)
-
-    def reset(self, rng: jax.Array) -> State:
-        """Still, hanging but for an angle of each joint in U(-0.1, 0.1)."""
-        hinges = self.sys.q_size() - 1
-        angles = jax.random.uniform(rng, (hinges,), minval=-0.1, maxval=0.1).at[0].add(jnp.pi)
-        positions = self.sys.init_q.at[1:].set(angles)
-        physics = self.pipeline_init(positions, jnp.zeros(self.sys.qd_size()))
-        return State(physics, None, jnp.float32(0), jnp.float32(0))
-
-    def step(self, state: State, action: jax.Array) -> State:
-        """Push the cart with `action` of the greatest force; reward: the sum of the cosines of the
-        joint's positions, the second relative to the first pole."""
-        physics = self.pipeline_step(state.pipeline_state, action * self._push)
-        return state.replace(pipeline_state=physics, reward=jnp.cos(physics.q[1:]).sum())
-
-
-class Physics:
-    """One task's dynamics as pure functions of Brax's state.
-
-    Attributes:
-        action_size: |A|.
-        positions: Q.
-        seconds: simulated time of one `step`.
-
-    Args:
-        title: one of the six names of the thesis, such as "Walker2D".
-        backend: Brax's engine: "generalized", "spring", "positional" or "mjx".
-    """
-
-    def __init__(self, title: str, backend: str):
-        steps = _PHYSICS_STEPS[title][backend in _SHORT_STEPS]
-        with _quiet():
-            if title in _BRAX_NAMES:
-                env = get_environment(_BRAX_NAMES[title], backend=backend, n_frames=steps)
-            else:
-                env = _Swingup(title, backend, steps)
-        self._env = env
-        self.action_size = env.action_size
-        self.positions = env.sys.q_size()
-        self.seconds = float(env.dt)
-
-    def start(self, key: jax.Array) -> Any:
-        """The state in which an episode starts."""
-        with _quiet():
-            return self._env.reset(key).pipeline_state
-
-    def step(self, state: Any, action: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
-        """Advance by one environment step with `action` (float32 [|A|], clipped to [-1, 1]).
-
-        Returns:
-            The state, the reward and whether the episode ended. A state in which the engine
-            has diverged ends it too, without reward, and is replaced by the one before.
-        """
-        before = State(state, None, jnp.float32(0), jnp.float32(0), {}, {})
-        with _quiet():
-            after = self._env.step(before, jnp.clip(action, -1.0, 1.0))
-        new, reward = after.pipeline_state, jnp.float32(after.reward)
-        finite = jnp.isfinite(jnp.concatenate([new.q, new.qd, reward[None]])).all()
-        new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, state)
-        return new, jnp.where(finite, reward, 0.0), ~finite | (after.done > 0.5)
-
-    def hold(self, state: Any, action: jax.Array, repeat: int):
-        """`repeat` steps with one action, fewer if the episode ends; rewards are summed."""
-
-        def one(carry, _):
-            state, total, over = carry
-            new, reward, terminal = self.step(state, action)
-            new = jax.tree.map(lambda a, b: jnp.where(over, a, b), state, new)
-            return (new, total + jnp.where(over, 0.0, reward), over | terminal), None
-
-        return jax.lax.scan(one, (state, jnp.float32(0), jnp.bool_(False)), None, repeat)[0]
-
-
-@functools.cache
-def physics_of(title: str, backend: str) -> Physics:
-    """One `Physics` for all who ask for it: models take a while to load."""
-    return Physics(title, backend)
 
 
 class BraxState(NamedTuple):
@@ -179,7 +50,10 @@ class BraxState(NamedTuple):
 
 
 class BraxEnv:
-    """An `Env` whose physics is part of the program; worker processes draw the pictures.
+    """An `Env` that is a part of the jitted program, without any host.
+
+    What cannot be simulated gives rewards that are not numbers: an action that is not finite, and
+    slots of which some are alike where all P * K are stepped at once.
 
     Args:
         tasks: K tasks; slot s plays tasks[s % K].
@@ -187,10 +61,10 @@ class BraxEnv:
         image_size: height and width of the images in pixels.
         action_repeat: environment steps for which an action is held.
         action_size: A, at least the largest |A| of the tasks.
-        workers: number of processes that draw, by default min(cores, slots).
+        workers: not used.
 
     Raises:
-        SimulatorError: if there is nothing to draw with, and what to install.
+        ValueError: for an image size that is too small.
     """
 
     discrete = False
@@ -205,6 +79,7 @@ class BraxEnv:
         workers: int | None = None,
     ):
         self.tasks = tuple(tasks)
+        check_size(image_size, self.tasks[0].supersample)
         self.members = members
         self.image_size = image_size
         self.action_repeat = action_repeat
@@ -214,6 +89,134 @@ class BraxEnv:
             Layout(jax.eval_shape(physics.start, jax.random.key(0))) for physics in self._physics
         ]
         self._words = max(layout.size for layout in self._layouts)
+        self._reset = mapped_rows(self._reset_rows)
+        self._step = mapped_rows(self._step_rows)
+
+    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[BraxState, TimeStep]:
+        """Start a phase, seeded by `key` (typed or raw), in `slot` (int32 [])."""
+        return self._reset(key_words(slot, key))
+
+    def step(self, state: BraxState, action: jax.Array) -> tuple[BraxState, TimeStep]:
+        """One tick with `action` (float32 [A], clipped to [-1, 1])."""
+        return self._step(action_words(state, action, self.action_size))
+
+    def check(self) -> None:
+        """Nothing: there is no host on which anything could fail."""
+
+    def close(self) -> None:
+        """Nothing: there is no host that holds anything."""
+
+    def _reset_rows(self, rows: jax.Array) -> tuple[BraxState, TimeStep]:
+        slots, words = rows[:, 0], jax.lax.bitcast_convert_type(rows[:, 1:], jnp.uint32)
+        keys = jax.vmap(_phase_key)(words)
+        nothing = jnp.zeros(len(rows), jnp.int32)
+        states, views = self._by_task(
+            [functools.partial(self._begin, k) for k in range(len(self.tasks))],
+            slots,
+            (keys, nothing),
+        )
+        state = BraxState(slots, keys, nothing, nothing, states)
+        images, bad = self._images(slots, views, jnp.zeros((len(rows), 0)))
+        no = nothing != 0
+        return state, TimeStep(images, jnp.where(bad, jnp.nan, jnp.float32(0)), ~no, no)
+
+    def _step_rows(self, rows: jax.Array) -> tuple[BraxState, TimeStep]:
+        keys, actions = (
+            jax.lax.bitcast_convert_type(part, dtype)
+            for part, dtype in (
+                (rows[:, 1:3], jnp.uint32),
+                (rows[:, 5 + self._words :], jnp.float32),
+            )
+        )
+        slots, episodes, ended = rows[:, 0], rows[:, 3], rows[:, 4] != 0
+        states, views, rewards, terminal = self._by_task(
+            [functools.partial(self._tick, k) for k in range(len(self.tasks))],
+            slots,
+            (keys, episodes + 1, ended, rows[:, 5 : 5 + self._words], actions),
+        )
+        state = BraxState(slots, keys, episodes + ended, terminal.astype(jnp.int32), states)
+        images, bad = self._images(slots, views, actions)
+        return state, TimeStep(images, jnp.where(bad, jnp.nan, rewards), ended, terminal)
+
+    def _by_task(self, functions, slots, rows):
+        return apply_by_group(functions, range(len(self.tasks)), self.members, slots, rows)
+
+    # Traced once for each number of rows, however many mappings are traced above it.
+    @functools.partial(jax.jit, static_argnums=(0, 1))
+    def _begin(self, task: int, rows):
+        """States of task number `task` that start episodes, and their views, for (keys,
+        episodes)."""
+        words = self._start(task, rows)
+        return words, self._views(task, words)
+
+    def _start(self, task: int, rows) -> jax.Array:
+        keys, episodes = rows
+        episode_keys = jax.vmap(jax.random.fold_in)(_typed(keys), episodes)
+        return self._packed(task, jax.vmap(self._physics[task].start)(episode_keys))
+
+    def _packed(self, task: int, states) -> jax.Array:
+        return jax.vmap(lambda state: self._layouts[task].pack(state, self._words))(states)
+
+    @functools.partial(jax.jit, static_argnums=(0, 1))
+    def _tick(self, task: int, rows):
+        """One tick of task number `task`: states, views, rewards, terminal."""
+        keys, next_episodes, ended, words, actions = rows
+        physics = self._physics[task]
+        states = jax.vmap(self._layouts[task].unpack)(words)
+        hold = functools.partial(physics.hold, repeat=self.action_repeat)
+        states, rewards, terminal = jax.vmap(hold)(states, actions[:, : physics.action_size])
+        moved = self._packed(task, states)
+
+        def restarted():
+            return jnp.where(ended[:, None], self._start(task, (keys, next_episodes)), moved)
+
+        # Falls are rare, and a start costs as much as a step.
+        words = jax.lax.cond(ended.any(), restarted, lambda: moved)
+        views = self._views(task, words)
+        return words, views, jnp.where(ended, 0.0, rewards), terminal & ~ended
+
+    def _views(self, task: int, words: jax.Array) -> jax.Array:
+        """What there is to see of states [n, W] of task number `task`: here, the images."""
+        states = jax.vmap(self._layouts[task].unpack)(words)
+        scene, spec = task_scene(self.tasks[task].title), self.tasks[task]
+
+        def drawn(state):
+            poses = self._physics[task].poses(state)
+            return render(scene, *poses, self.image_size, spec.supersample)
+
+        return jax.vmap(drawn)(states)
+
+    def _images(self, slots, views, actions) -> tuple[jax.Array, jax.Array]:
+        """Images of views, and which of them come of what cannot be simulated."""
+        bad = ~jnp.isfinite(actions).all(axis=1)
+        if len(slots) == self.members * len(self.tasks):
+            # Tasks were told apart by the order of the slots.
+            bad |= (jnp.sort(slots) != jnp.arange(len(slots))).any()
+        return views, bad
+
+
+class HostDrawnBraxEnv(BraxEnv):
+    """An `Env` whose physics is part of the program; worker processes draw the pictures.
+
+    Args:
+        tasks, members, image_size, action_repeat, action_size: as of `BraxEnv`.
+        workers: number of processes that draw, by default min(cores, slots).
+
+    Raises:
+        ValueError: for an image size that is too small.
+        SimulatorError: if there is nothing to draw with, and what to install.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[TaskSpec],
+        members: int,
+        image_size: int,
+        action_repeat: int,
+        action_size: int,
+        workers: int | None = None,
+    ):
+        super().__init__(tasks, members, image_size, action_repeat, action_size)
         self._positions = max(physics.positions for physics in self._physics)
         self._calls = HostCalls()
         self._pool = SimulatorPool(
@@ -228,16 +231,6 @@ class BraxEnv:
         self._draw = self._calls.mapped(
             self._host_draw, jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8)
         )
-        self._reset = mapped_rows(self._reset_rows)
-        self._step = mapped_rows(self._step_rows)
-
-    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[BraxState, TimeStep]:
-        """Start a phase, seeded by `key` (typed or raw), in `slot` (int32 [])."""
-        return self._reset(key_words(slot, key))
-
-    def step(self, state: BraxState, action: jax.Array) -> tuple[BraxState, TimeStep]:
-        """One tick with `action` (float32 [A], clipped to [-1, 1])."""
-        return self._step(action_words(state, action, self.action_size))
 
     def check(self) -> None:
         """Wait for callbacks under way and raise the error that one of them met, if any.
@@ -252,80 +245,18 @@ class BraxEnv:
         jax.effects_barrier()
         self._pool.close()
 
-    def _reset_rows(self, rows: jax.Array) -> tuple[BraxState, TimeStep]:
-        slots, words = rows[:, 0], jax.lax.bitcast_convert_type(rows[:, 1:], jnp.uint32)
-        keys = jax.vmap(_phase_key)(words)
-        nothing = jnp.zeros(len(rows), jnp.int32)
-        states, positions = self._by_task(
-            [functools.partial(self._start, k) for k in range(len(self.tasks))],
-            slots,
-            (keys, nothing),
-        )
-        state = BraxState(slots, keys, nothing, nothing, states)
-        image = self._pictures(slots, positions, jnp.zeros((len(rows), 0)))
-        no = nothing != 0
-        return state, TimeStep(image, jnp.zeros(len(rows), jnp.float32), ~no, no)
-
-    def _step_rows(self, rows: jax.Array) -> tuple[BraxState, TimeStep]:
-        keys, actions = (
-            jax.lax.bitcast_convert_type(part, dtype)
-            for part, dtype in (
-                (rows[:, 1:3], jnp.uint32),
-                (rows[:, 5 + self._words :], jnp.float32),
-            )
-        )
-        slots, episodes, ended = rows[:, 0], rows[:, 3], rows[:, 4] != 0
-        states, positions, rewards, terminal = self._by_task(
-            [functools.partial(self._tick, k) for k in range(len(self.tasks))],
-            slots,
-            (keys, episodes + 1, ended, rows[:, 5 : 5 + self._words], actions),
-        )
-        state = BraxState(slots, keys, episodes + ended, terminal.astype(jnp.int32), states)
-        image = self._pictures(slots, positions, actions)
-        return state, TimeStep(image, rewards, ended, terminal)
-
-    def _by_task(self, functions, slots, rows):
-        return apply_by_group(functions, range(len(self.tasks)), self.members, slots, rows)
-
-    # Traced once for each number of rows, however many mappings are traced above it.
-    @functools.partial(jax.jit, static_argnums=(0, 1))
-    def _start(self, task: int, rows) -> tuple[jax.Array, jax.Array]:
-        """States of task number `task` that start episodes, and positions, for (keys, episodes)."""
-        keys, episodes = rows
-        episode_keys = jax.vmap(jax.random.fold_in)(_typed(keys), episodes)
-        return self._packed(task, jax.vmap(self._physics[task].start)(episode_keys))
-
-    def _packed(self, task: int, states) -> tuple[jax.Array, jax.Array]:
-        layout, missing = self._layouts[task], self._positions - self._physics[task].positions
-        words = jax.vmap(lambda state: layout.pack(state, self._words))(states)
-        return words, jnp.pad(states.q, ((0, 0), (0, missing)))
-
-    @functools.partial(jax.jit, static_argnums=(0, 1))
-    def _tick(self, task: int, rows):
-        """One tick of task number `task`: states, positions, rewards, terminal."""
-        keys, next_episodes, ended, words, actions = rows
-        physics = self._physics[task]
+    def _views(self, task: int, words: jax.Array) -> jax.Array:
+        """Joint positions float32 [n, Q] of states [n, W] of task number `task`."""
         states = jax.vmap(self._layouts[task].unpack)(words)
-        hold = functools.partial(physics.hold, repeat=self.action_repeat)
-        states, rewards, terminal = jax.vmap(hold)(states, actions[:, : physics.action_size])
-        moved = self._packed(task, states)
+        missing = self._positions - self._physics[task].positions
+        return jnp.pad(states.q, ((0, 0), (0, missing)))
 
-        def restarted():
-            return jax.tree.map(
-                lambda new, old: jnp.where(ended[:, None], new, old),
-                self._start(task, (keys, next_episodes)),
-                moved,
-            )
-
-        # Falls are rare, and a start costs as much as a step.
-        words, positions = jax.lax.cond(ended.any(), restarted, lambda: moved)
-        return words, positions, jnp.where(ended, 0.0, rewards), terminal & ~ended
-
-    def _pictures(self, slots, positions, actions) -> jax.Array:
+    def _images(self, slots, views, actions) -> tuple[jax.Array, jax.Array]:
         bad = ~jnp.isfinite(actions).all(axis=1)
-        bits = jax.lax.bitcast_convert_type(positions.astype(jnp.float32), jnp.int32)
+        bits = jax.lax.bitcast_convert_type(views.astype(jnp.float32), jnp.int32)
         head = jnp.stack([slots, bad.astype(jnp.int32)], axis=1)
-        return jax.vmap(self._draw)(jnp.concatenate([head, bits], axis=1))
+        # The host says what is wrong.
+        return jax.vmap(self._draw)(jnp.concatenate([head, bits], axis=1)), jnp.zeros_like(bad)
 
     def _host_draw(self, rows: np.ndarray) -> np.ndarray:
         slots, bad, positions = rows[:, 0], rows[:, 1] != 0, rows[:, 2:].view(np.float32)
@@ -354,12 +285,10 @@ def _typed(keys: jax.Array) -> jax.Array:
 
 def _drawing(task: TaskSpec) -> TaskSpec:
     """What a simulator process hosts for a task: it takes joint positions for actions."""
-    return TaskSpec(
-        name=task.name,
-        title=task.title,
+    return replace(
+        task,
         action_size=physics_of(task.title, task.physics).positions,
         simulator="envs.mujoco_pictures:Drawing",
-        gymnasium_id=task.gymnasium_id,
     )
 
 
@@ -370,12 +299,23 @@ class BraxSimulator:
         title: one of the six names of the thesis, such as "Walker2D".
         image_size: height and width of the rendered images in pixels.
         backend: Brax's engine.
+        renderer: "jax" or "mujoco".
+
+    Raises:
+        ValueError: for an image size that is too small.
+        SimulatorError: if MuJoCo is to draw and finds no driver.
     """
 
-    def __init__(self, title: str, image_size: int, backend: str):
-        self._physics = physics_of(title, backend)
+    def __init__(self, title: str, image_size: int, backend: str, renderer: str):
+        check_size(image_size)
         self._start, self._step = _compiled(title, backend)
-        self._pictures = pictures(title, image_size)
+        self._draw = _drawn_by_jax(title, backend, image_size)
+        if renderer == "mujoco":
+            # Imported here: looking for a driver takes a while.
+            from envs.mujoco_pictures import pictures
+
+            drawn = pictures(title, image_size)
+            self._draw = lambda state: drawn.draw(np.asarray(state.q))
         self._state: Any = None
 
     def reset(self, seed: int) -> None:
@@ -390,7 +330,7 @@ class BraxSimulator:
 
     def render(self) -> np.ndarray:
         """The present picture, uint8 [image_size, image_size, 3]."""
-        return self._pictures.draw(np.asarray(self._state.q))
+        return np.array(self._draw(self._state))
 
     def close(self) -> None:
         """Forget the state."""
@@ -404,10 +344,21 @@ def _compiled(title: str, backend: str):
     return start, jax.jit(physics.step)
 
 
-# The simulators of each backend, to be found by name.
+@functools.cache
+def _drawn_by_jax(title: str, backend: str, image_size: int):
+    poses = physics_of(title, backend).poses
+    return jax.jit(lambda state: render(task_scene(title), *poses(state), image_size))
+
+
+# The simulators of each engine and renderer, to be found by name.
 simulators = SimpleNamespace(
     **{
-        backend: functools.partial(BraxSimulator, backend=backend)
-        for backend in ("generalized", "spring", "positional", "mjx")
+        backend: SimpleNamespace(
+            **{
+                renderer: functools.partial(BraxSimulator, backend=backend, renderer=renderer)
+                for renderer in BRAX_RENDERERS
+            }
+        )
+        for backend in BRAX_ENGINES
     }
 )

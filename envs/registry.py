@@ -25,6 +25,9 @@ def _bullet(name: str, title: str, action_size: int) -> TaskSpec:
 
 # Brax's physics engines, the first the one that its own environments use by default.
 BRAX_ENGINES = ("generalized", "spring", "positional", "mjx")
+# What can draw a Brax task, the first what does unless another is named: JAX, as a part of the
+# program (`envs.ray_casting`), or MuJoCo in processes of its own.
+BRAX_RENDERERS = ("jax", "mujoco")
 
 
 def _brax(name: str, title: str, action_size: int, step_seconds: float) -> TaskSpec:
@@ -32,11 +35,16 @@ def _brax(name: str, title: str, action_size: int, step_seconds: float) -> TaskS
         name=f"brax/{name}",
         title=title,
         action_size=action_size,
-        simulator=f"envs.brax_pixels:simulators.{BRAX_ENGINES[0]}",
+        simulator=_brax_simulator(BRAX_ENGINES[0], BRAX_RENDERERS[0]),
         gymnasium_id=f"brax_pixels/{title}-v0",
         step_seconds=step_seconds,
         physics=BRAX_ENGINES[0],
+        renderer=BRAX_RENDERERS[0],
     )
+
+
+def _brax_simulator(engine: str, renderer: str) -> str:
+    return f"envs.brax_pixels:simulators.{engine}.{renderer}"
 
 
 _TASKS = {
@@ -59,19 +67,20 @@ _TASKS = {
     )
 }
 
-# The `Env` of each backend, by the first part of a task's name. Named, not imported: JAX stays
-# out of simulator processes, and a backend's packages need not be installed unless it is used.
-_BACKENDS = {
-    "bullet": "envs.bridge:HostEnv",
-    "brax": "envs.brax_pixels:BraxEnv",
-    "gymnasium": "envs.bridge:HostEnv",
+# The `Env` of tasks, by what draws them: "" is their own simulator on the host. Named, not
+# imported: JAX stays out of simulator processes, and a backend's packages need not be installed
+# unless it is used.
+_ENVS = {
+    "": "envs.bridge:HostEnv",
+    "jax": "envs.brax_pixels:BraxEnv",
+    "mujoco": "envs.brax_pixels:HostDrawnBraxEnv",
 }
 
 
 def task_names() -> tuple[str, ...]:
     """The names of the tasks of this package, installed or not. Beside them, `gymnasium/ID` is
-    the gymnasium environment of that id, and `brax/NAME@ENGINE` a Brax task in another of its
-    physics engines."""
+    the gymnasium environment of that id, and `brax/NAME@ENGINE:RENDERER` a Brax task with another
+    of its physics engines (`@ENGINE`), another renderer (`:RENDERER`), or both."""
     return tuple(_TASKS)
 
 
@@ -88,20 +97,34 @@ def spec(name: str) -> TaskSpec:
     backend, _, id = name.partition("/")
     if backend == "gymnasium" and id:
         return gymnasium_task(id)
-    base, at, engine = name.partition("@")
-    if at and base in _TASKS and backend == "brax":
-        if engine in BRAX_ENGINES:
-            simulator = f"envs.brax_pixels:simulators.{engine}"
-            return replace(_TASKS[base], name=name, simulator=simulator, physics=engine)
-        raise ValueError(
-            f"unknown physics engine {engine!r} in the task {name!r}, expected one of "
-            f"{', '.join(BRAX_ENGINES)}"
-        )
+    if backend == "brax" and (task := _brax_choice(name)) is not None:
+        return task
     near = difflib.get_close_matches(name, _TASKS)
     hint = f" Did you mean {' or '.join(near)}?" if near else ""
     raise ValueError(
         f"unknown task {name!r}, expected one of {', '.join(_TASKS)}, or gymnasium/ID.{hint}"
     )
+
+
+def _brax_choice(name: str) -> TaskSpec | None:
+    """The task `brax/NAME@ENGINE:RENDERER`, of which either choice may be missing; None if there
+    is no such NAME."""
+    rest, colon, renderer = name.partition(":")
+    base, at, engine = rest.partition("@")
+    if base not in _TASKS or not (at or colon):
+        return None
+    for kind, sign, chosen, choices in (
+        ("physics engine", at, engine, BRAX_ENGINES),
+        ("renderer", colon, renderer, BRAX_RENDERERS),
+    ):
+        if sign and chosen not in choices:
+            raise ValueError(
+                f"unknown {kind} {chosen!r} in the task {name!r}, expected one of "
+                f"{', '.join(choices)}: brax/NAME@ENGINE:RENDERER"
+            )
+    engine, renderer = engine or BRAX_ENGINES[0], renderer or BRAX_RENDERERS[0]
+    simulator = _brax_simulator(engine, renderer)
+    return replace(_TASKS[base], name=name, simulator=simulator, physics=engine, renderer=renderer)
 
 
 def specs(names: Sequence[str]) -> tuple[TaskSpec, ...]:
@@ -170,7 +193,7 @@ def make(
             f"got action_size={action_size}, but of the tasks {list(tasks)} the largest needs "
             f"{largest}"
         )
-    makers = [_BACKENDS[name.partition("/")[0]] for name in tasks]
+    makers = [_ENVS[task.renderer] for task in known]
     places = {maker: [k for k, other in enumerate(makers) if other == maker] for maker in makers}
     parts = []
     try:

@@ -1,7 +1,7 @@
 """The six Brax tasks: Brax's physics and rewards, swing-ups, pictures, reproducible to the bit.
 
 P member, K task, T ticks. Physics is compiled here for the pendula and the Hopper; of the other
-tasks only models and pictures are looked at.
+tasks only models and pictures are looked at (tests/test_ray_casting.py compares both renderers).
 """
 
 import hashlib
@@ -25,6 +25,7 @@ import envs
 from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
 from envs.mixed import MixedEnv
+from envs.scene import Geometry, Scene
 from probes import Probe
 
 NAMES = [name for name in envs.task_names() if name.startswith("brax/")]
@@ -34,8 +35,19 @@ SWINGUP = "brax/inverted_pendulum"
 
 @pytest.fixture(scope="module")
 def brax_pixels():
-    """The module, where Brax is installed and something can draw."""
-    module = pytest.importorskip("envs.brax_pixels", reason="brax is not installed")
+    return pytest.importorskip("envs.brax_pixels", reason="brax is not installed")
+
+
+@pytest.fixture(scope="module")
+def brax_physics():
+    return pytest.importorskip("envs.brax_physics", reason="brax is not installed")
+
+
+@pytest.fixture(scope="module")
+def drawing(brax_pixels):
+    """MuJoCo's pictures, where it can draw: looked for after Brax has imported MuJoCo."""
+    import envs.mujoco_pictures as module
+
     try:
         module.pictures("InvertedPendulum", 8)
     except SimulatorError as error:
@@ -45,8 +57,16 @@ def brax_pixels():
 
 @pytest.fixture(scope="module")
 def env(brax_pixels):
-    """P = 2 members of the swing-up, in one process that draws."""
-    made = envs.make([SWINGUP], members=2, image_size=16, workers=1)
+    """P = 2 members of the swing-up."""
+    made = envs.make([SWINGUP], members=2, image_size=16)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def hosted(drawing):
+    """The same, in one process that draws."""
+    made = envs.make([f"{SWINGUP}:mujoco"], members=2, image_size=16, workers=1)
     yield made
     made.close()
 
@@ -68,7 +88,14 @@ def phase_of(env, tasks, ticks):
         env.check()
         return result
 
+    run.phase = phase
     return run
+
+
+def psnr(one, other) -> np.ndarray:
+    """Peak signal-to-noise ratio of pictures [..., height, width, 3] in decibel."""
+    error = np.square(one.astype(np.float64) - other).mean((-3, -2, -1))
+    return 10 * np.log10(255**2 / np.maximum(error, 1e-9))
 
 
 def same(one, two) -> bool:
@@ -88,14 +115,36 @@ def test_six_tasks_have_the_sizes_of_pybullets():
         assert envs.spec(name).time_limit == other.time_limit
 
 
-def test_the_physics_engine_is_part_of_the_name():
-    task = envs.spec("brax/hopper@spring")
-    assert (task.physics, task.title) == ("spring", "Hopper")
-    assert envs.spec("brax/hopper").physics == "generalized"
-    with pytest.raises(ValueError, match="unknown physics engine 'sprng'.*generalized, spring"):
-        envs.spec("brax/hopper@sprng")
-    with pytest.raises(ValueError, match="unknown task 'bullet/hopper@spring'"):
-        envs.spec("bullet/hopper@spring")
+def test_engine_and_renderer_are_parts_of_the_name():
+    kinds = {
+        "brax/hopper": ("generalized", "jax"),
+        "brax/hopper@spring": ("spring", "jax"),
+        "brax/hopper:mujoco": ("generalized", "mujoco"),
+        "brax/hopper@mjx:mujoco": ("mjx", "mujoco"),
+        "brax/hopper@mjx:jax": ("mjx", "jax"),
+    }
+    for name, kind in kinds.items():
+        task = envs.spec(name)
+        assert (task.physics, task.renderer, task.title) == (*kind, "Hopper")
+        assert (task.name, task.gymnasium_id) == (name, "brax_pixels/Hopper-v0")
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("brax/hopper@sprng", "unknown physics engine 'sprng'.*expected one of generalized, sp"),
+        ("brax/hopper@", "unknown physics engine ''"),
+        ("brax/hopper:opengl", "unknown renderer 'opengl'.*jax, mujoco: brax/NAME@ENGINE:REND"),
+        ("brax/hopper@spring:", "unknown renderer ''"),
+        ("brax/hopper:mujoco@spring", "unknown renderer 'mujoco@spring'"),
+        ("bullet/hopper@spring", "unknown task 'bullet/hopper@spring'"),
+        ("bullet/hopper:mujoco", "unknown task 'bullet/hopper:mujoco'"),
+        ("brax/hoper:mujoco", "Did you mean brax/hopper"),
+    ],
+)
+def test_wrong_choices_are_refused(name, message):
+    with pytest.raises(ValueError, match=message):
+        envs.spec(name)
 
 
 def test_without_brax_making_a_task_says_what_to_install(tmp_path):
@@ -107,10 +156,7 @@ def test_without_brax_making_a_task_says_what_to_install(tmp_path):
         "try: envs.make(['brax/ant'])\n"
         "except ModuleNotFoundError as error: print(error)"
     )
-    environment = os.environ | {"MUJOCO_GL": "egl"}
-    said = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
-    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "pip install 'dreamer-transfer[brax]'" in said.stdout, said.stderr
 
 
@@ -126,22 +172,29 @@ def test_where_nothing_draws_the_error_names_the_packages():
     )
     assert said.returncode != 0
     assert "apt-get install libegl1" in said.stderr and "libosmesa6" in said.stderr
+    assert "without ':mujoco'" in said.stderr
 
 
-def test_importing_brax_says_nothing(brax_pixels):
-    code = "import envs.brax_pixels as module; module.physics_of('Hopper', 'generalized')"
+def test_importing_brax_says_nothing(brax_pixels, tmp_path):
+    code = "import envs.brax_pixels as module; module.physics_of('Walker2D', 'generalized')"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     said = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=environment,
+        cwd=tmp_path,
     )
     assert (said.returncode, said.stdout, said.stderr) == (0, "", "")
+    assert not any(tmp_path.iterdir()), "no log"
 
 
 # Physics
 
 
 @pytest.mark.parametrize("title, name", list(zip(TITLES, NAMES, strict=True)))
-def test_an_agent_step_is_about_as_long_as_pybullets(brax_pixels, title, name):
-    physics = brax_pixels.physics_of(title, "generalized")
+def test_an_agent_step_is_about_as_long_as_pybullets(brax_physics, title, name):
+    physics = brax_physics.physics_of(title, "generalized")
     task = envs.spec(name)
     assert physics.seconds == pytest.approx(task.step_seconds)
     assert physics.action_size == task.action_size
@@ -149,13 +202,13 @@ def test_an_agent_step_is_about_as_long_as_pybullets(brax_pixels, title, name):
     assert 0.9 <= task.step_seconds / bullet.step_seconds <= 1.25
 
 
-def test_the_hopper_is_brax_own(brax_pixels):
+def test_the_hopper_is_brax_own(brax_physics):
     """The same states, rewards and falls as Brax's environment with actions held as long, in the
     engine that compiles soonest."""
     from brax.envs import get_environment
 
     own = get_environment("hopper", backend="spring", n_frames=8)
-    physics = brax_pixels.physics_of("Hopper", "spring")
+    physics = brax_physics.physics_of("Hopper", "spring")
     actions = jax.random.uniform(jax.random.key(1), (30, 3), minval=-1, maxval=1)
 
     @jax.jit
@@ -180,8 +233,8 @@ def test_the_hopper_is_brax_own(brax_pixels):
 
 
 @pytest.mark.parametrize("title", ["InvertedPendulum", "InvertedDoublePendulum"])
-def test_pendula_start_hanging_and_are_paid_the_cosines(brax_pixels, title):
-    physics = brax_pixels.physics_of(title, "generalized")
+def test_pendula_start_hanging_and_are_paid_the_cosines(brax_physics, title):
+    physics = brax_physics.physics_of(title, "generalized")
     keys = jax.random.split(jax.random.key(0), 200)
     starts = jax.jit(jax.vmap(lambda key: physics.start(key).q))(keys)
     offsets = np.asarray(starts - jnp.array([0, np.pi, 0])[: physics.positions])
@@ -218,8 +271,8 @@ def test_pendula_start_hanging_and_are_paid_the_cosines(brax_pixels, title):
     assert 1.0 < np.abs(carts).max() < 1.2
 
 
-def test_a_state_that_is_not_finite_ends_the_episode_before_it(brax_pixels):
-    physics = brax_pixels.physics_of("InvertedPendulum", "generalized")
+def test_a_state_that_is_not_finite_ends_the_episode_before_it(brax_physics):
+    physics = brax_physics.physics_of("InvertedPendulum", "generalized")
 
     shapes = jax.eval_shape(physics.start, jax.random.key(0))
     before = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), shapes)
@@ -247,11 +300,33 @@ def test_a_phase_hangs_at_first_and_repeats_to_the_bit_after_others(env):
 FRESH_PROCESS = """
 import hashlib, sys, jax, envs
 from test_brax import SWINGUP, phase_of
-env = envs.make([SWINGUP], members=2, image_size=16, workers=2)
+env = envs.make([SWINGUP], members=2, image_size=16)
 leaves = jax.tree.leaves(phase_of(env, tasks=1, ticks=30)(0))
 print(hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest())
 env.close()
 """
+
+
+def test_both_renderers_show_the_same_phase(env, hosted):
+    one, other = (phase_of(made, tasks=1, ticks=10)(0)[1] for made in (env, hosted))
+    np.testing.assert_allclose(one.reward, other.reward, atol=1e-4)
+    assert psnr(one.image, other.image).mean() > 35
+
+
+def test_no_host_is_part_of_a_phase(env, hosted):
+    def program(made):
+        return phase_of(made, tasks=1, ticks=30).phase.lower(jax.random.key(0))
+
+    assert "callback" in program(hosted).as_text()
+    assert "callback" not in program(env).as_text()
+    assert "callback" not in program(env).compile().as_text()
+
+
+@pytest.mark.parametrize("renderer", ["jax", "mujoco"])
+@pytest.mark.parametrize("size", [7, 32.0], ids=str)
+def test_image_sizes_that_nothing_can_be_seen_in_are_refused(brax_pixels, renderer, size):
+    with pytest.raises(ValueError, match=f"image size of {size}, expected a whole number of at l"):
+        envs.make([f"{SWINGUP}:{renderer}"], image_size=size)
 
 
 def test_a_phase_is_the_same_in_a_fresh_process(env):
@@ -268,15 +343,15 @@ def test_a_phase_is_the_same_in_a_fresh_process(env):
 
 
 @pytest.fixture
-def counting(brax_pixels, monkeypatch):
+def counting(brax_pixels, brax_physics, monkeypatch):
     """Environments of physics known by hand: an episode of task "Ant" ends with its 3rd step, of
-    any other with its 5th; the reward is the first action, the hinge shows the step's number."""
+    any other with its 5th; the reward is the first action, what is drawn moves with the steps."""
 
     class State(NamedTuple):
         q: jax.Array
         steps: jax.Array
 
-    class Counting(brax_pixels.Physics):
+    class Counting(brax_physics.Physics):
         action_size, positions = 1, 2
 
         def __init__(self, title, backend):
@@ -289,14 +364,19 @@ def counting(brax_pixels, monkeypatch):
             steps = state.steps + 1
             return State(jnp.array([0.0, 1.0]) * steps, steps), action[0], steps == self.end
 
+        def poses(self, state):
+            return jnp.zeros((1, 3)).at[0, 2].set(0.2 * state.steps), jnp.array([[1.0, 0, 0, 0]])
+
     monkeypatch.setattr(brax_pixels, "physics_of", Counting)
+    ball = Scene((Geometry("sphere", (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), link=0),))
+    monkeypatch.setattr(brax_pixels, "task_scene", lambda title: ball)
     pendulum = replace(envs.spec(SWINGUP), simulator="envs.mujoco_pictures:Drawing")
     monkeypatch.setattr(brax_pixels, "_drawing", lambda task: replace(pendulum, action_size=2))
     made = []
 
-    def make(*names, members=1, repeat=1):
-        tasks = [envs.spec(name) for name in names]
-        made.append(brax_pixels.BraxEnv(tasks, members, 8, repeat, 2, workers=1))
+    def make(kind, *names, members=1, repeat=1, size=8, supersample=1):
+        tasks = [replace(envs.spec(name), supersample=supersample) for name in names]
+        made.append(getattr(brax_pixels, kind)(tasks, members, size, repeat, 2, workers=1))
         return made[-1]
 
     yield make
@@ -304,8 +384,18 @@ def counting(brax_pixels, monkeypatch):
         one.close()
 
 
-def test_the_action_is_held_up_to_a_fall_and_the_next_tick_resets(counting):
-    env = counting("brax/ant", repeat=2)
+KINDS = ["BraxEnv", "HostDrawnBraxEnv"]
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    if request.param == "HostDrawnBraxEnv":
+        request.getfixturevalue("drawing")
+    return request.param
+
+
+def test_the_action_is_held_up_to_a_fall_and_the_next_tick_resets(counting, kind):
+    env = counting(kind, "brax/ant", repeat=2)
     state, _ = env.reset(jnp.int32(0), jax.random.key(0))
     actions = jnp.array([[1.0, 9], [0.5, 9], [7.0, 9], [-2.0, 9]])
     state, record = jax.jit(lambda state: jax.lax.scan(env.step, state, actions))(state)
@@ -317,8 +407,8 @@ def test_the_action_is_held_up_to_a_fall_and_the_next_tick_resets(counting):
 
 
 @pytest.mark.parametrize("slots", [[2, 1, 3, 0], [1, 2]], ids=str)
-def test_each_slot_plays_its_own_task_in_any_order_and_number(counting, slots):
-    env = counting("brax/ant", "brax/hopper", members=2)
+def test_each_slot_plays_its_own_task_in_any_order_and_number(counting, kind, slots):
+    env = counting(kind, "brax/ant", "brax/hopper", members=2)
     slots = jnp.array(slots)
 
     @jax.jit
@@ -336,7 +426,35 @@ def test_each_slot_plays_its_own_task_in_any_order_and_number(counting, slots):
         np.testing.assert_array_equal(record.reward[:ends, column], slot + 1.0)
 
 
-def test_slots_that_are_alike_or_missing_are_refused(env):
+def test_pictures_show_the_state_after_a_tick_and_after_a_reset(counting):
+    env = counting("BraxEnv", "brax/ant")
+    state, start = env.reset(jnp.int32(0), jax.random.key(0))
+    images = jax.lax.scan(env.step, state, jnp.zeros((5, 2)))[1].image
+    rows = [np.flatnonzero((image < 255).any((1, 2))).mean() for image in (start.image, *images)]
+    assert rows[0] > rows[1] > rows[2] > rows[3] < rows[4] == rows[0], "it rises, and is put back"
+    assert rows[5] == rows[1]
+
+
+def test_pictures_are_averaged_from_larger_ones(counting):
+    def image(**sizes):
+        return counting("BraxEnv", "brax/ant", **sizes).reset(0, jax.random.key(0))[1].image
+
+    blocks = image(size=16).reshape(8, 2, 8, 2, 3).astype(int).sum((1, 3))
+    np.testing.assert_array_equal(image(size=8, supersample=2), (blocks + 2) // 4)
+
+
+def test_without_a_host_what_cannot_be_simulated_gives_no_numbers(counting):
+    env = counting("BraxEnv", "brax/ant", "brax/hopper", members=1)
+    keys = jax.random.split(jax.random.key(0), 2)
+    for slots, spoilt in [([1, 1], True), ([0, 2], True), ([1, 0], False)]:
+        assert np.isnan(jax.vmap(env.reset)(jnp.array(slots), keys)[1].reward).all() == spoilt
+    states, _ = jax.vmap(env.reset)(jnp.arange(2), keys)
+    actions = jnp.array([[jnp.nan, 0.0], [0.5, 0.0]])
+    np.testing.assert_array_equal(jax.vmap(env.step)(states, actions)[1].reward, [np.nan, 0.5])
+
+
+def test_slots_that_are_alike_or_missing_are_refused(hosted):
+    env = hosted
     keys = jax.random.split(jax.random.key(0), 2)
     for slots, message in [([1, 1], "some are alike"), ([0, 2], "expected 0 to 1")]:
         jax.vmap(env.reset)(jnp.array(slots), keys)
@@ -344,16 +462,16 @@ def test_slots_that_are_alike_or_missing_are_refused(env):
             env.check()
 
 
-def test_an_action_that_is_not_finite_is_an_error_naming_slot_and_task(counting):
-    env = counting("brax/ant")
+def test_an_action_that_is_not_finite_is_an_error_naming_slot_and_task(counting, drawing):
+    env = counting("HostDrawnBraxEnv", "brax/ant")
     state, _ = env.reset(jnp.int32(0), jax.random.key(0))
     env.step(state, jnp.array([jnp.nan, 0.0]))
     with pytest.raises(SimulatorError, match=r"slot 0 \(brax/ant\) got an action that is not fin"):
         env.check()
 
 
-def test_a_dead_renderer_is_reported_and_does_not_hang(counting):
-    env = counting("brax/ant", members=2)
+def test_a_dead_renderer_is_reported_and_does_not_hang(counting, drawing):
+    env = counting("HostDrawnBraxEnv", "brax/ant", members=2)
     process = env._pool._workers[0].process
     process.kill()
     process.wait()
@@ -417,8 +535,8 @@ def silhouette(image) -> np.ndarray:
 
 
 @pytest.mark.parametrize("title", TITLES)
-def test_pictures_are_drawn_as_the_joints_say_before_a_white_sky(brax_pixels, title):
-    pictures = brax_pixels.pictures(title, 64)
+def test_pictures_are_drawn_as_the_joints_say_before_a_white_sky(drawing, title):
+    pictures = drawing.pictures(title, 64)
     rest = pictures.draw(pictures.positions)
     assert rest.shape == (64, 64, 3) and rest.dtype == np.uint8
     assert (rest[0, 0] == 255).all() and (rest[0, -1] == 255).all()
@@ -429,8 +547,8 @@ def test_pictures_are_drawn_as_the_joints_say_before_a_white_sky(brax_pixels, ti
 
 
 @pytest.mark.parametrize("title", ["Hopper", "Walker2D", "InvertedPendulum"])
-def test_the_camera_follows_a_walker_and_stays_with_a_pendulum(brax_pixels, title):
-    pictures = brax_pixels.pictures(title, 64)
+def test_the_camera_follows_a_walker_and_stays_with_a_pendulum(drawing, title):
+    pictures = drawing.pictures(title, 64)
     away = pictures.positions.copy()
     away[0] = 0.5
     moved = silhouette(pictures.draw(away)) - silhouette(pictures.draw(pictures.positions))
@@ -445,10 +563,10 @@ def test_the_camera_follows_a_walker_and_stays_with_a_pendulum(brax_pixels, titl
 
 
 @pytest.mark.parametrize("title", ["Hopper", "Walker2D", "InvertedPendulum"])
-def test_bodies_are_where_pybullet_shows_them(brax_pixels, title):
+def test_bodies_are_where_pybullet_shows_them(drawing, title):
     bullet = pytest.importorskip("envs.bullet").BulletSimulator(title, 64)
     bullet.reset(0)
-    pictures = brax_pixels.pictures(title, 64)
+    pictures = drawing.pictures(title, 64)
     positions = pictures.positions.copy()
     positions[1] += np.pi * (title == "InvertedPendulum")
     brax = silhouette(pictures.draw(positions))
@@ -460,11 +578,20 @@ def test_bodies_are_where_pybullet_shows_them(brax_pixels, title):
 
 
 @pytest.mark.parametrize("title", TITLES)
-def test_gymnasium_ids_have_the_spaces_of_the_task(brax_pixels, title):
+def test_gymnasium_ids_have_the_spaces_of_the_task(brax_physics, title):
     with gymnasium.make(f"brax_pixels/{title}-v0", image_size=32) as env:
-        size = brax_pixels.physics_of(title, "generalized").action_size
+        size = brax_physics.physics_of(title, "generalized").action_size
         assert env.observation_space == gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8)
         assert env.action_space == gymnasium.spaces.Box(-1, 1, (size,), np.float32)
+
+
+def test_gymnasium_simulators_of_both_renderers_look_alike(drawing):
+    def image(renderer):
+        task = envs.spec(f"{SWINGUP}:{renderer}")
+        env = gymnasium.make(task.gymnasium_id, task=task, image_size=64)
+        return env.reset(seed=0)[0]
+
+    assert psnr(image("jax"), image("mujoco")) > 28
 
 
 def test_gymnasiums_checker_has_nothing_to_say_and_seeds_repeat(brax_pixels):

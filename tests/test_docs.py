@@ -1,0 +1,51 @@
+"""Every block of Python in the pages of docs/ runs and prints what the page shows under it."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parent.parent / "docs"
+BLOCK = re.compile(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", re.DOTALL)
+
+
+def sections(page):
+    """Title -> its blocks: (code, what it prints)."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    parts = re.split(r"^## (.*)$", text, flags=re.MULTILINE)
+    found = {
+        title: BLOCK.findall(text) for title, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
+    return {title: blocks for title, blocks in found.items() if blocks}
+
+
+def run(page, title, names):
+    for code, shown in sections(page)[title]:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(code, f"{page}: {title}", "exec"), names)
+        assert printed.getvalue() == shown
+
+
+@pytest.mark.parametrize("title", sections("transfer.md"))
+def test_the_page_on_transfer_prints_what_it_shows(title):
+    run("transfer.md", title, {})
+
+
+def test_the_page_on_the_renderer_prints_what_it_shows():
+    """Its sections go on from one another."""
+    pytest.importorskip("mujoco")
+    names = {}
+    for title in sections("renderer.md"):
+        run("renderer.md", title, names)
+    assert len(sections("renderer.md")) == 2
+
+
+def test_the_page_shows_three_uses():
+    uses = [title for title in sections("transfer.md") if title.startswith("Use ")]
+    assert len(uses) == 3
+    assert all(
+        "dreamer_jax" not in code for title in uses for code, _ in sections("transfer.md")[title]
+    )
