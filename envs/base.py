@@ -29,6 +29,8 @@ class TaskSpec:
         step_seconds: simulated time of one environment step, in seconds.
         discrete: whether an action is one of |A| choices, given as a one-hot vector.
         physics: the physics engine, of a backend that has several.
+        levels: known returns of whole episodes of `time_limit` environment steps, as pairs of what
+            was done and the return it brought, measured on this simulator.
         supersample: pictures are drawn this many times as large, and averaged down.
         renderer: what draws the pictures, of a backend that has several renderers.
     """
@@ -43,6 +45,7 @@ class TaskSpec:
     step_seconds: float = 0.0165
     discrete: bool = False
     physics: str = ""
+    levels: tuple[tuple[str, float], ...] = ()
     supersample: int = 1
     renderer: str = ""
 

@@ -13,6 +13,32 @@ from envs.base import Env, TaskSpec
 from envs.gymnasium_simulator import gymnasium_task
 
 
+# Returns of whole episodes at an action repeat of 2, from 20 episodes at random and 5 of the rest.
+# A saturated actor presses a pendulum's cart against an end of the rail (constant action); who
+# swings it up at once and keeps it there has balanced it.
+_LEVELS = {
+    "bullet/ant": {"no action": 10.0, "random actions": 401.0},
+    "bullet/halfcheetah": {"no action": -1368.0, "random actions": -1165.0},
+    "bullet/hopper": {"no action": 44.0, "random actions": 18.0},
+    "bullet/walker2d": {"no action": 38.0, "random actions": 15.0},
+    "bullet/inverted_pendulum": {
+        "no action": -1000.0,
+        "constant action": -837.0,
+        "random actions": -875.0,
+        "balanced": 880.0,
+    },
+    "bullet/inverted_double_pendulum": {
+        "no action": -1.0,
+        "constant action": -203.0,
+        "random actions": -322.0,
+    },
+}
+
+
+def _levels(name: str) -> tuple[tuple[str, float], ...]:
+    return tuple(_LEVELS.get(name, {}).items())
+
+
 def _bullet(name: str, title: str, action_size: int) -> TaskSpec:
     return TaskSpec(
         name=f"bullet/{name}",
@@ -20,6 +46,7 @@ def _bullet(name: str, title: str, action_size: int) -> TaskSpec:
         action_size=action_size,
         simulator="envs.bullet:BulletSimulator",
         gymnasium_id=f"bullet_pixels/{title}-v0",
+        levels=_levels(f"bullet/{name}"),
     )
 
 
@@ -37,6 +64,7 @@ def _brax(name: str, title: str, action_size: int, step_seconds: float) -> TaskS
         action_size=action_size,
         simulator=_brax_simulator(BRAX_ENGINES[0], BRAX_RENDERERS[0]),
         gymnasium_id=f"brax_pixels/{title}-v0",
+        levels=_levels(f"brax/{name}"),
         step_seconds=step_seconds,
         physics=BRAX_ENGINES[0],
         renderer=BRAX_RENDERERS[0],

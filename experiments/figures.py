@@ -13,6 +13,7 @@ import envs
 from experiments import comparison, grid
 from experiments.graph import task_name
 from experiments.grid import Cell, Figure
+from experiments.levels import draw_levels
 from experiments.results import Outcome
 
 TRANSFER, BASELINE = "tab:blue", "tab:green"
@@ -147,6 +148,7 @@ def draw_curves(
     for axis, panel in zip(axes.flat, shown, strict=False):
         for curve in panel.curves:
             _draw_curve(axis, curve, panel.task, [outcomes[cell] for cell in curve.cells])
+        draw_levels(axis, [task_name(figure.backend, panel.task)])
         axis.set_title(panel.title)
         axis.grid(alpha=0.3)
         axis.legend(frameon=False, fontsize="small")

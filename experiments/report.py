@@ -17,6 +17,7 @@ import numpy as np
 import envs
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
+from experiments.levels import draw_levels
 from experiments.spec import BASELINE, RunSpec, read_spec
 from experiments.statistics import FINAL_SHARE, mean_and_deviation
 
@@ -199,6 +200,7 @@ def _draw(panels: Mapping[str, Sequence[Curve]], stem: Path) -> list[Path]:
                 alpha=0.15,
                 lw=0,
             )
+        draw_levels(axis, {row["task"] for curve in curves for row in curve.rows})
         axis.set_title(title)
         axis.set_xlabel("environment steps")
         axis.set_ylabel("return of an evaluation episode")
