@@ -428,7 +428,14 @@ class Agent:
         )(self, parts["model"], params, batch, model_key)
         (_, behaviour_metrics), behaviour_gradient = jax.value_and_grad(
             learning.behaviour_loss, argnums=1, has_aux=True
-        )(self, parts["actor"] | parts["value"], params, posterior, behaviour_key)
+        )(
+            self,
+            parts["actor"] | parts["value"],
+            params,
+            posterior,
+            behaviour_key,
+            state.updates,
+        )
         gradients = {"model": model_gradient} | {
             name: {part: behaviour_gradient[part] for part in parts[name]}
             for name in ("actor", "value")

@@ -81,6 +81,9 @@ class LearningConfig:
     """Floor of the mean KL divergence between posterior and prior, in nats."""
     kl_scale: float = 1.0
     """Weight of the KL divergence in the model's loss."""
+    kl_prior_scale: float | None = None
+    """Weight of the KL divergence as the prior is trained by it, kl_scale being that of the
+    posterior alone; none given: kl_scale for both, as in the thesis."""
     image_std: float = 1.0
     """Standard deviation of the image's Gaussian likelihood, in units of the pixel range. The
     image loss is divided by its square: 0.5 at 32 x 32 pixels weighs a picture as 64 x 64 does."""
@@ -97,6 +100,10 @@ class LearningConfig:
     entropy_scale: float = 0.0
     """Weight of the policy's entropy in the actor's loss, in rewards per nat (the thesis has
     none). It keeps an actor from settling on one action early."""
+    entropy_scale_end: float | None = None
+    """What entropy_scale has fallen to after entropy_decay updates; none given: it stays."""
+    entropy_decay: int = 10_000
+    """Updates over which entropy_scale falls linearly to entropy_scale_end."""
     gradient_norm: float = 100.0
     """Largest norm of the gradient of each of the three groups; larger ones are scaled down."""
     adam_epsilon: float = 1e-7
@@ -113,6 +120,20 @@ class LearningConfig:
         _require(self.horizon >= 2, f"horizon is {self.horizon}, but a return needs at least 2")
         for name in ("batch_size", "sequence_length"):
             _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
+        for name in ("image_std", "reward_std"):
+            value = getattr(self, name)
+            _require(value > 0, f"{name} is {value}, a standard deviation must be positive")
+        for name in ("free_nats", "kl_scale", "kl_prior_scale", "entropy_scale_end"):
+            value = getattr(self, name)
+            _require(value is None or value >= 0, f"{name} is {value}, must not be negative")
+        _require(
+            self.entropy_scale >= 0, f"entropy_scale is {self.entropy_scale}, must not be negative"
+        )
+        _require(self.entropy_decay > 0, f"entropy_decay is {self.entropy_decay}, must be positive")
+        _require(
+            self.entropy_scale > 0 or not self.entropy_scale_end,
+            f"entropy_scale is 0 and would rise to {self.entropy_scale_end}: give both, or neither",
+        )
         starts, states = self.imagination_starts, self.batch_size * self.sequence_length
         _require(
             starts is None or 0 < starts <= states,
@@ -140,6 +161,12 @@ class ExplorationConfig:
     """Probability of a random action after epsilon_decay updates."""
     epsilon_decay: int = 200_000
     """Updates over which epsilon falls linearly."""
+
+    def __post_init__(self):
+        _require(
+            self.exploration_hold >= 1,
+            f"exploration_hold is {self.exploration_hold}, but an action lasts at least 1 step",
+        )
 
 
 @dataclass(frozen=True)
@@ -176,7 +203,8 @@ class ScheduleConfig:
             f"phase_environment_steps is {self.phase_environment_steps}, which is no multiple of "
             f"the action repeat {self.action_repeat}",
         )
-        for name in ("environment_steps", "evaluate_every", "checkpoint_every", "mapping_chunk"):
+        positive = ("environment_steps", "evaluate_every", "checkpoint_every", "mapping_chunk")
+        for name in (*positive, "supersample"):
             _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
         _require(self.prefill_phases > 0, "prefill_phases must be at least 1: updates need data")
 

@@ -98,9 +98,7 @@ def _episode(agent: Agent, params: Params, records: Batch, key: jax.Array):
     last = jnp.where(records.first & (times > 0), times, len(times)).min() - 1
     fell = records.terminal[last]
     last_value = jnp.where(fell, records.reward[last], values[last])
-    returns = discounted_returns(
-        records.reward, last_value, last, agent.config.learning.discount
-    )
+    returns = discounted_returns(records.reward, last_value, last, agent.config.learning.discount)
     inside = times <= last
     metrics = {"value_bias": _mean(values - returns, inside)}
 
@@ -140,9 +138,7 @@ SETTLED = 500
 """Updates before which the divergence says nothing: the model has yet to find what to encode."""
 
 
-def warnings(
-    averages: Mapping[str, float], config: LearningConfig, updates: int
-) -> dict[str, str]:
+def warnings(averages: Mapping[str, float], config: LearningConfig, updates: int) -> dict[str, str]:
     """What keeps an agent from learning, in words, with the setting that helps.
 
     Args:

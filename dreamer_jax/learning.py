@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from dreamer_jax import losses, networks, rssm
+from dreamer_jax.config import LearningConfig
 from dreamer_jax.convolutions import arrange, image_distance
 
 if TYPE_CHECKING:
@@ -50,7 +52,15 @@ def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, ke
     reward_loss = losses.unit_gaussian_loss(agent.reward(params, features), batch.reward)
     kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
     loss = image_loss / config.image_std**2 + reward_loss / config.reward_std**2
-    loss += config.kl_scale * losses.floored_kl(kl, config.free_nats)
+    if config.kl_prior_scale is None:
+        loss += config.kl_scale * losses.floored_kl(kl, config.free_nats)
+    else:
+        fixed_mean, fixed_std = jax.lax.stop_gradient((posterior.mean, posterior.std))
+        for_prior = losses.gaussian_kl(fixed_mean, fixed_std, prior_mean, prior_std)
+        fixed_mean, fixed_std = jax.lax.stop_gradient((prior_mean, prior_std))
+        for_posterior = losses.gaussian_kl(posterior.mean, posterior.std, fixed_mean, fixed_std)
+        loss += config.kl_prior_scale * losses.floored_kl(for_prior, config.free_nats)
+        loss += config.kl_scale * losses.floored_kl(for_posterior, config.free_nats)
     mean_kl = kl.mean()
     metrics = {
         "image_loss": image_loss,
@@ -76,6 +86,7 @@ def behaviour_loss(
     params: Params,
     posterior: rssm.LatentState,
     key: jax.Array,
+    updates: jax.Array | int = 0,
 ):
     """Loss of the actor plus loss of the value head, both on the same imagined states.
 
@@ -90,6 +101,7 @@ def behaviour_loss(
       params: all components.
       posterior: states to start from, leaves [B, L, ...]; no gradient reaches them.
       key: for starts, actions and states.
+      updates: int [], updates so far, for the schedule of the entropy's weight.
 
     Returns:
       The sum of the losses, and metrics.
@@ -141,9 +153,18 @@ def behaviour_loss(
         saturated = jnp.abs(jnp.tanh(before_tanh)) > SATURATED
         metrics |= {"actor_std": std.mean(), "actor_saturation": saturated.mean()}
     if config.entropy_scale:
-        actor_loss -= config.entropy_scale * (weights * entropy).mean()
+        actor_loss -= _entropy_scale(config, updates) * (weights * entropy).mean()
     metrics |= {"actor_loss": actor_loss, "actor_entropy": entropy.mean()}
     return actor_loss + value_loss, metrics
+
+
+def _entropy_scale(config: LearningConfig, updates: jax.Array | int) -> jax.Array | float:
+    """The weight of the policy's entropy after some updates."""
+    if config.entropy_scale_end is None:
+        return config.entropy_scale
+    return optax.linear_schedule(
+        config.entropy_scale, config.entropy_scale_end, config.entropy_decay
+    )(updates)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

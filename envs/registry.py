@@ -12,7 +12,6 @@ import gymnasium
 from envs.base import Env, TaskSpec
 from envs.gymnasium_simulator import gymnasium_task
 
-
 # Returns of whole episodes at an action repeat of 2, from 20 episodes at random and 5 of the rest.
 # A saturated actor presses a pendulum's cart against an end of the rail (constant action); who
 # swings it up at once and keeps it there has balanced it.

@@ -386,6 +386,23 @@ def test_entropys_weight_spreads_continuous_actions_over_their_range():
     assert 0.6 < last_std < 1.3
 
 
+def test_the_entropys_weight_falls_linearly_to_its_end(agent, state):
+    falling = Agent(
+        with_settings("learning", entropy_scale=0.5, entropy_scale_end=0.1, entropy_decay=1000),
+        A,
+    )
+    posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(1))
+
+    @jax.jit
+    def loss(updates):
+        return behaviour_loss(falling, {}, state.params, posterior, jax.random.key(2), updates)[0]
+
+    at = {updates: float(loss(updates)) for updates in (0, 500, 1000, 5000)}
+    assert_allclose(at[500], (at[0] + at[1000]) / 2, rtol=1e-4)
+    assert at[1000] == at[5000]
+    assert at[0] != at[1000]
+
+
 def test_the_entropys_gradient_goes_through_the_samples():
     outputs, noise = jnp.array([[0.3, -1.2, 0.1, -4.0]]), jnp.array([[0.4, -0.7]])
 
@@ -422,6 +439,31 @@ def test_the_divergence_of_first_records_is_told_apart(agent, state):
     assert_allclose(metrics["kl_at_start"], kl[:, 0].mean(), rtol=1e-4)
     assert_allclose(metrics["kl_share_below_floor"], (kl < 3.0).mean())
     assert metrics["kl_floored"] == (metrics["kl"] < 3.0)
+
+
+def test_the_priors_own_weight_trains_it_apart_from_the_posterior():
+    batch, key = batch_of(), jax.random.key(1)
+
+    def gradient(**settings):
+        agent = Agent(with_settings("learning", free_nats=0.0, **settings), A)
+        params = jax.jit(agent.init_params)(jax.random.key(0))
+
+        def loss(dynamics):
+            return model_loss(agent, {}, params | {"dynamics": dynamics}, batch, key)[0]
+
+        return jax.jit(jax.grad(loss))(params["dynamics"])
+
+    # The two halves with one weight are the whole divergence.
+    chex.assert_trees_all_close(
+        gradient(kl_scale=0.7, kl_prior_scale=0.7), gradient(kl_scale=0.7), rtol=1e-3, atol=1e-5
+    )
+    only_posterior = gradient(kl_scale=0.7, kl_prior_scale=0.0)
+    chex.assert_trees_all_equal(
+        only_posterior["prior"], jax.tree.map(jnp.zeros_like, only_posterior["prior"])
+    )
+    none, only_prior = gradient(kl_scale=0.0), gradient(kl_scale=0.0, kl_prior_scale=0.7)
+    assert optax.tree.norm(only_prior["prior"]) > 0
+    assert optax.tree.norm(none["prior"]) == 0
 
 
 @pytest.mark.parametrize("discrete", [False, True])
@@ -484,9 +526,7 @@ def test_epsilon_greedy_falls_from_its_start_to_its_end():
     @jax.jit
     @jax.vmap
     def explored(key, updates):
-        action, _ = agent._explore(
-            jnp.full(1, 0.123), jnp.zeros(1), jnp.bool_(False), key, updates
-        )
+        action, _ = agent._explore(jnp.full(1, 0.123), jnp.zeros(1), jnp.bool_(False), key, updates)
         return action[0] != jnp.float32(0.123)
 
     keys = jax.random.split(jax.random.key(0), 4000)

@@ -66,9 +66,7 @@ def test_an_episode_that_fell_is_worth_no_more_than_its_rewards():
     records.reward[:] = 0.0
     records.terminal[0, 0, 9] = True
     records.first[0, 0, 10] = True
-    found = diagnose(
-        AGENT, params_of(1, value=7.0), records, jnp.zeros(1, jnp.int32), jnp.int32(1)
-    )
+    found = diagnose(AGENT, params_of(1, value=7.0), records, jnp.zeros(1, jnp.int32), jnp.int32(1))
     assert_allclose(found["value_bias"], [[7.0]], rtol=1e-5)
     # Nine records lie after the first: none is 15 steps ahead of another.
     assert np.isfinite(found["reward_error_5"]).all()
@@ -77,9 +75,7 @@ def test_an_episode_that_fell_is_worth_no_more_than_its_rewards():
 
 def test_a_constant_prediction_of_rewards_errs_by_their_distance():
     records = records_of(2, 2)
-    found = diagnose(
-        AGENT, params_of(2, reward=0.5), records, jnp.array([3, 4]), jnp.int32(1)
-    )
+    found = diagnose(AGENT, params_of(2, reward=0.5), records, jnp.array([3, 4]), jnp.int32(1))
     for steps in (5, 15):
         expected = np.abs(records.reward[..., steps:] - 0.5).mean(-1)
         assert_allclose(found[f"reward_error_{steps}"], expected, rtol=1e-5)

@@ -13,7 +13,7 @@ import pytest
 import envs
 from envs.base import Outcome
 from envs.pool import SimulatorPool
-from envs.wrappers import ActionPadding, ActionRepeat, TimeLimit
+from envs.wrappers import ActionPadding, ActionRepeat, TimeLimit, averaged
 
 NAMES = [name for name in envs.task_names() if name.startswith("bullet/")]
 LOCOMOTION = [name for name in NAMES if "pendulum" not in name]
@@ -327,3 +327,48 @@ def test_no_time_limit_ends_a_phase():
     env.check()
     env.close()
     assert not record.first.any() and not record.terminal.any()
+
+
+# Supersampling
+
+
+def test_a_block_of_pixels_becomes_its_mean_rounded_half_up():
+    image = np.zeros((4, 2, 3), np.uint8)
+    image[:2, :, 0] = [[255, 255], [255, 0]]
+    image[2:, :, 1] = [[1, 1], [0, 0]]
+    small = averaged(image, 2)
+    assert small.shape == (2, 1, 3) and small.dtype == np.uint8
+    assert small[:, 0].tolist() == [[191, 0, 0], [0, 1, 0]]
+    np.testing.assert_array_equal(averaged(image, 1), image)
+
+
+def test_supersampled_pictures_are_the_means_of_larger_ones():
+    pytest.importorskip("envs.bullet")
+    pictures = {}
+    for size, factor in ((128, 1), (32, 4)):
+        env = envs.make(["bullet/inverted_pendulum"], image_size=size, supersample=factor)
+        try:
+            _, start = jax.vmap(env.reset)(jnp.arange(1), jax.random.split(jax.random.key(0), 1))
+            env.check()
+        finally:
+            env.close()
+        pictures[factor] = np.asarray(start.image[0])
+    assert pictures[4].shape == (32, 32, 3)
+    np.testing.assert_array_equal(pictures[4], averaged(pictures[1], 4))
+    assert len(np.unique(pictures[4])) > len(np.unique(averaged(pictures[1][::4, ::4], 1)))
+
+
+def test_a_factor_below_one_is_refused():
+    with pytest.raises(ValueError, match="got supersample=0, expected at least 1"):
+        envs.make(["bullet/hopper"], supersample=0)
+
+
+def test_the_pendulums_known_levels_are_what_constant_actions_bring():
+    bullet = pytest.importorskip("envs.bullet")
+    levels = dict(envs.spec("bullet/inverted_pendulum").levels)
+    for name, action in (("no action", 0.0), ("constant action", 1.0)):
+        simulator = bullet.BulletSimulator("InvertedPendulum", 32)
+        simulator.reset(seed=3)
+        total = sum(simulator.step(np.array([action])).reward for _ in range(1000))
+        simulator.close()
+        assert abs(total - levels[name]) < 15, name
