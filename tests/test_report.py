@@ -8,6 +8,7 @@ from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from experiments import report
 from experiments.__main__ import main
+from experiments.levels import draw_levels
 from experiments.spec import RunSpec
 
 
@@ -91,3 +92,39 @@ def test_a_folder_without_a_run_or_evaluations_is_named(folder, tmp_path, capsys
         assert str(other) in said and message in said
     assert main(["report"]) == 2
     assert "name a results folder" in capsys.readouterr().err
+
+
+def axis_with(*returns):
+    from matplotlib.figure import Figure
+
+    axis = Figure().subplots()
+    axis.plot(range(len(returns)), returns)
+    return axis
+
+
+def test_levels_near_the_curves_are_drawn_with_their_names():
+    axis = axis_with(-900.0, 100.0)
+    draw_levels(axis, ["bullet/inverted_pendulum", "bullet/inverted_pendulum"])
+    assert [text.get_text() for text in axis.texts] == [
+        "no action (-1000)",
+        "random actions (-875)",
+        "constant action (-837)",
+        "balanced (880)",
+    ]
+    drawn = [line.get_ydata()[0] for line in axis.lines[1:]]
+    assert drawn == [-1000, -875, -837, 880]
+    assert axis.get_ylim()[1] > 880
+
+
+def test_levels_far_from_the_curves_are_left_out():
+    # Episodes of 40 environment steps have other returns than those of 1000.
+    axis = axis_with(-40.0, -30.0)
+    before = axis.get_ylim()
+    draw_levels(axis, ["bullet/inverted_pendulum"])
+    assert not axis.texts and axis.get_ylim() == before
+
+
+def test_an_environment_whose_levels_are_not_known_has_none():
+    axis = axis_with(0.0, 100.0)
+    draw_levels(axis, ["gymnasium/CartPole-v1"])
+    assert not axis.texts
