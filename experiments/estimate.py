@@ -18,6 +18,7 @@ import numpy as np
 
 import envs
 from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.config import Config
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
@@ -124,11 +125,10 @@ def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what:
         loss.block_until_ready()
         updates += 1
     update_seconds = (time.perf_counter() - started) / updates
-    image_size, repeat = agent.config.network.image_size, agent.config.schedule.action_repeat
     ticks = {}
     for number, task in enumerate(tasks, start=2):
         tell(f"[{number}/{things}] {task}")
-        ticks[task] = _tick_seconds(task, image_size, repeat)
+        ticks[task] = _tick_seconds(task, agent.config)
     return Speed(
         update_seconds=update_seconds,
         update_bytes=update_bytes,
@@ -161,10 +161,16 @@ def _policy_seconds(agent: Agent, params) -> float:
     return (time.perf_counter() - started) / TICKS
 
 
-def _tick_seconds(task: str, image_size: int, action_repeat: int) -> tuple[float, float]:
+def _tick_seconds(task: str, config: Config) -> tuple[float, float]:
     """Seconds for a tick of one simulator, what carries it to jitted code included, and seconds
     until the first."""
-    env = envs.make([task], 1, image_size, action_repeat, workers=1)
+    env = envs.make(
+        [task],
+        image_size=config.network.image_size,
+        action_repeat=config.schedule.action_repeat,
+        workers=1,
+        supersample=config.schedule.supersample,
+    )
     try:
         made = time.perf_counter()
         state, _ = jax.jit(jax.vmap(env.reset))(
