@@ -81,9 +81,6 @@ class LearningConfig:
     """Floor of the mean KL divergence between posterior and prior, in nats."""
     kl_scale: float = 1.0
     """Weight of the KL divergence in the model's loss."""
-    kl_prior_scale: float | None = None
-    """Weight of the KL divergence as the prior is trained by it, kl_scale being that of the
-    posterior alone; none given: kl_scale for both, as in the thesis."""
     image_std: float = 1.0
     """Standard deviation of the image's Gaussian likelihood, in units of the pixel range. The
     image loss is divided by its square: 0.5 at 32 x 32 pixels weighs a picture as 64 x 64 does."""
@@ -123,7 +120,7 @@ class LearningConfig:
         for name in ("image_std", "reward_std"):
             value = getattr(self, name)
             _require(value > 0, f"{name} is {value}, a standard deviation must be positive")
-        for name in ("free_nats", "kl_scale", "kl_prior_scale", "entropy_scale_end"):
+        for name in ("free_nats", "kl_scale", "entropy_scale_end"):
             value = getattr(self, name)
             _require(value is None or value >= 0, f"{name} is {value}, must not be negative")
         _require(

@@ -52,15 +52,7 @@ def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, ke
     reward_loss = losses.unit_gaussian_loss(agent.reward(params, features), batch.reward)
     kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
     loss = image_loss / config.image_std**2 + reward_loss / config.reward_std**2
-    if config.kl_prior_scale is None:
-        loss += config.kl_scale * losses.floored_kl(kl, config.free_nats)
-    else:
-        fixed_mean, fixed_std = jax.lax.stop_gradient((posterior.mean, posterior.std))
-        for_prior = losses.gaussian_kl(fixed_mean, fixed_std, prior_mean, prior_std)
-        fixed_mean, fixed_std = jax.lax.stop_gradient((prior_mean, prior_std))
-        for_posterior = losses.gaussian_kl(posterior.mean, posterior.std, fixed_mean, fixed_std)
-        loss += config.kl_prior_scale * losses.floored_kl(for_prior, config.free_nats)
-        loss += config.kl_scale * losses.floored_kl(for_posterior, config.free_nats)
+    loss += config.kl_scale * losses.floored_kl(kl, config.free_nats)
     mean_kl = kl.mean()
     metrics = {
         "image_loss": image_loss,

@@ -441,31 +441,6 @@ def test_the_divergence_of_first_records_is_told_apart(agent, state):
     assert metrics["kl_floored"] == (metrics["kl"] < 3.0)
 
 
-def test_the_priors_own_weight_trains_it_apart_from_the_posterior():
-    batch, key = batch_of(), jax.random.key(1)
-
-    def gradient(**settings):
-        agent = Agent(with_settings("learning", free_nats=0.0, **settings), A)
-        params = jax.jit(agent.init_params)(jax.random.key(0))
-
-        def loss(dynamics):
-            return model_loss(agent, {}, params | {"dynamics": dynamics}, batch, key)[0]
-
-        return jax.jit(jax.grad(loss))(params["dynamics"])
-
-    # The two halves with one weight are the whole divergence.
-    chex.assert_trees_all_close(
-        gradient(kl_scale=0.7, kl_prior_scale=0.7), gradient(kl_scale=0.7), rtol=1e-3, atol=1e-5
-    )
-    only_posterior = gradient(kl_scale=0.7, kl_prior_scale=0.0)
-    chex.assert_trees_all_equal(
-        only_posterior["prior"], jax.tree.map(jnp.zeros_like, only_posterior["prior"])
-    )
-    none, only_prior = gradient(kl_scale=0.0), gradient(kl_scale=0.0, kl_prior_scale=0.7)
-    assert optax.tree.norm(only_prior["prior"]) > 0
-    assert optax.tree.norm(none["prior"]) == 0
-
-
 @pytest.mark.parametrize("discrete", [False, True])
 def test_random_actions_are_held_as_long_as_told_on_average(discrete):
     agent = Agent(with_settings("exploration", exploration_hold=8.0), 2, discrete)

@@ -16,7 +16,6 @@ POSITIVE = "must be positive|a standard deviation must be positive"
         (LearningConfig, "reward_std", (0.0, -1.0, math.nan), POSITIVE),
         (LearningConfig, "free_nats", (-1.0, math.nan), "must not be negative"),
         (LearningConfig, "kl_scale", (-1.0, math.nan), "must not be negative"),
-        (LearningConfig, "kl_prior_scale", (-1.0, math.nan), "must not be negative"),
         (LearningConfig, "entropy_scale", (-0.1, math.nan), "must not be negative"),
         (LearningConfig, "entropy_decay", (0, -1), POSITIVE),
         (ExplorationConfig, "exploration_hold", (0.0, 0.99, math.nan), "at least 1 step"),
