@@ -14,6 +14,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import envs
+
+BRAX = ",".join(name for name in envs.task_names() if name.startswith("brax/"))
+
 COMMANDS = {
     "convolutions": "convolutions",
     "update-small": "update depth=8 deter=100 stoch=20 units=200 B=16 L=20 n=15",
@@ -22,7 +26,8 @@ COMMANDS = {
     "update-bfloat16": "update depth=8 deter=100 stoch=20 units=200 B=16 L=20 precision=bfloat16",
     "population": "population",
     "rollout": "rollout",
-    "rollout-brax": "rollout task=brax/hopper,brax/ant,brax/inverted_pendulum P=1,8",
+    "rollout-brax": f"rollout task={BRAX} P=1,8 image_size=32",
+    "rollout-brax-64": f"rollout task={BRAX} P=1,8 image_size=64",
     "replay": "replay",
     "transfer": "transfer",
     "train": "train",

@@ -6,9 +6,10 @@
 Prints one line of JSON. "bridge" is a jitted scan over vmapped steps with random actions. Beside
 it, for simulators on the host, "bare" is a plain Python loop over as many of them in as many
 processes, with no JAX and nobody to wait for: what the machine can do at most; "ratio" is their
-quotient. For Brax, whose physics is part of the jitted program, "drawing" and "physics" are the
-shares of the time that passes while the processes draw, and otherwise. Rates are the best of the
-repetitions.
+quotient. For Brax, "jax" and "mujoco" are the same scan with pictures drawn by either, in turns, and
+"ratio" is the first over the second; "drawing_jax" and "drawing_mujoco" are the shares of the time
+that go into pictures: of as many pictures drawn alone, or that passes while the processes draw.
+Rates are the best of the repetitions.
 """
 
 from __future__ import annotations
@@ -65,40 +66,122 @@ def bare_rate(task, members: int, steps: int, image_size: int, workers: int) -> 
         return members * steps / max(future.result() for future in futures)
 
 
-def bridge_rates(task, members: int, steps: int, image_size: int, workers: int, repetitions: int):
-    """Agent steps per second of each repetition, and the share of its time that passed in the
-    simulators' processes; compilation and resets left out."""
+class Rollout:
+    """A jitted rollout of one task with random actions, compiled and ready to be timed."""
+
+    def __init__(self, task, members: int, steps: int, image_size: int, workers: int):
+        import jax
+        import jax.numpy as jnp
+
+        self.members, self.steps = members, steps
+        self.env = env = envs.make([task.name], members, image_size, task.action_repeat, workers)
+        # Seconds that passed while simulators or renderers of their own processes worked.
+        self._waits: list[float] = []
+        if (pool := getattr(env, "_pool", None)) is not None:
+            pool.step = self._timed(pool.step)
+
+        @jax.jit
+        def reset(key):
+            return jax.vmap(env.reset)(jnp.arange(members), jax.random.split(key, members))[0]
+
+        @jax.jit
+        def roll(state, key):
+            actions = jax.random.uniform(key, (steps, members, task.action_size), minval=-1.0)
+            return jax.lax.scan(jax.vmap(env.step), state, actions)
+
+        self._reset, self._roll = reset, roll
+        started = time.perf_counter()
+        self.run()
+        self.first_seconds = time.perf_counter() - started
+
+    def _timed(self, step):
+        def call(*arguments):
+            start = time.perf_counter()
+            try:
+                return step(*arguments)
+            finally:
+                self._waits.append(time.perf_counter() - start)
+
+        return call
+
+    def run(self) -> tuple[float, float]:
+        """Agent steps per second without resets, and the share of the time that was waited."""
+        import jax
+
+        state = jax.block_until_ready(self._reset(jax.random.key(0)))
+        self._waits.clear()
+        start = time.perf_counter()
+        jax.block_until_ready(self._roll(state, jax.random.key(1)))
+        seconds = time.perf_counter() - start
+        self.env.check()
+        return self.members * self.steps / seconds, sum(self._waits) / seconds
+
+
+def drawing_rates(task, members: int, steps: int, image_size: int, repetitions: int):
+    """Pictures per second of a Brax task, drawn by JAX `members` at a time in a jitted scan."""
     import jax
     import jax.numpy as jnp
 
-    env = envs.make([task.name], members, image_size, task.action_repeat, workers)
-    pool_step, waits = env._pool.step, []
+    from envs.brax_physics import physics_of, task_scene
+    from envs.ray_casting import render
 
-    def timed_step(*arguments):
-        start = time.perf_counter()
-        result = pool_step(*arguments)
-        waits.append(time.perf_counter() - start)
-        return result
-
-    env._pool.step = timed_step
-    reset = jax.jit(jax.vmap(env.reset))
+    physics, scene = physics_of(task.title, task.physics), task_scene(task.title)
+    poses = jax.jit(lambda key: physics.poses(physics.start(key)))(jax.random.key(0))
 
     @jax.jit
-    def roll(state, key):
-        actions = jax.random.uniform(key, (steps, members, task.action_size), minval=-1.0)
-        return jax.lax.scan(jax.vmap(env.step), state, actions)
+    def draw(moves):
+        def tick(_, move):
+            places = poses[0] + move[:, None, None]
+            return None, jax.vmap(lambda x: render(scene, x, poses[1], image_size))(places)
 
-    for repetition in range(repetitions + 1):
-        state, _ = reset(jnp.arange(members), jax.random.split(jax.random.key(0), members))
-        jax.block_until_ready(state)
-        waits.clear()
+        return jax.lax.scan(tick, None, moves)
+
+    moves = jnp.linspace(0, 0.1, steps * members).reshape(steps, members)
+    jax.block_until_ready(draw(moves))
+    for _ in range(repetitions):
         start = time.perf_counter()
-        jax.block_until_ready(roll(state, jax.random.key(1)))
-        seconds = time.perf_counter() - start
-        env.check()
-        if repetition > 0:
-            yield members * steps / seconds, sum(waits) / seconds
-    env.close()
+        jax.block_until_ready(draw(moves))
+        yield members * steps / (time.perf_counter() - start)
+
+
+def brax_row(task, members: int, steps: int, image_size: int, workers: int, repetitions: int):
+    """Both renderers in turns."""
+    rollouts = {
+        renderer: Rollout(envs.spec(f"{task.name}:{renderer}"), members, steps, image_size, workers)
+        for renderer in ("jax", "mujoco")
+    }
+    rates = {renderer: [] for renderer in rollouts}
+    alone = drawing_rates(task, members, steps, image_size, repetitions)
+    drawn = []
+    for _ in range(repetitions):
+        for renderer, rollout in rollouts.items():
+            rates[renderer].append(rollout.run())
+        drawn.append(next(alone))
+    for rollout in rollouts.values():
+        rollout.env.close()
+    (jax_rate, _), (mujoco_rate, waited) = (max(rates[x]) for x in ("jax", "mujoco"))
+    return {
+        "jax": round(jax_rate, 1),
+        "mujoco": round(mujoco_rate, 1),
+        "ratio": round(jax_rate / mujoco_rate, 2),
+        "drawing_jax": round(jax_rate / max(drawn), 3),
+        "drawing_mujoco": round(waited, 3),
+        "first_seconds_jax": round(rollouts["jax"].first_seconds, 1),
+        "first_seconds_mujoco": round(rollouts["mujoco"].first_seconds, 1),
+    }
+
+
+def host_row(task, members: int, steps: int, image_size: int, workers: int, repetitions: int):
+    """Through the bridge, and bare."""
+    rollout = Rollout(task, members, steps, image_size, workers)
+    bridge, _ = max(rollout.run() for _ in range(repetitions))
+    rollout.env.close()
+    bare = max(bare_rate(task, members, steps, image_size, workers) for _ in range(repetitions))
+    return {
+        "bridge": round(bridge, 1),
+        "bare": round(bare, 1),
+        "ratio": round(bridge / bare, 3),
+    }
 
 
 def main(arguments: list[str]) -> None:
@@ -112,22 +195,9 @@ def main(arguments: list[str]) -> None:
     for task in map(envs.spec, settings["task"].split(",")):
         for members in map(int, settings["P"].split(",")):
             workers = min(int(settings["workers"] or available_cores()), members)
-            bridge, waiting = max(
-                bridge_rates(task, members, steps, image_size, workers, repetitions)
-            )
-            row = {
-                "task": task.name,
-                "P": members,
-                "workers": workers,
-                "bridge": round(bridge, 1),
-            }
-            if task.name.startswith("brax/"):
-                row |= {"drawing": round(waiting, 3), "physics": round(1 - waiting, 3)}
-            else:
-                bare = max(
-                    bare_rate(task, members, steps, image_size, workers) for _ in range(repetitions)
-                )
-                row |= {"bare": round(bare, 1), "ratio": round(bridge / bare, 3)}
+            row = {"task": task.name, "P": members, "workers": workers}
+            kind = brax_row if task.name.startswith("brax/") else host_row
+            row |= kind(task, members, steps, image_size, workers, repetitions)
             results.append(row)
     print(
         json.dumps(

@@ -49,8 +49,9 @@ def shares(spec: RunSpec, directory: Path) -> dict:
     """Seconds from a run's first evaluation to its second by what they went to."""
     run = make_run(spec, directory)
     simulators, waiting = Stopwatch(), Stopwatch()
-    pool, replay, writer = run.env._pool, run.replay, run.writer
-    pool.reset, pool.step = simulators.timed(pool.reset), simulators.timed(pool.step)
+    replay, writer = run.replay, run.writer
+    if (pool := getattr(run.env, "_pool", None)) is not None:
+        pool.reset, pool.step = simulators.timed(pool.reset), simulators.timed(pool.step)
     batches, write_timing = replay.batches, writer.write_timing
     rows, moments = [], []
 
