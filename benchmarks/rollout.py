@@ -6,9 +6,9 @@
 Prints one line of JSON. "bridge" is a jitted scan over vmapped steps with random actions. Beside
 it, for simulators on the host, "bare" is a plain Python loop over as many of them in as many
 processes, with no JAX and nobody to wait for: what the machine can do at most; "ratio" is their
-quotient. For Brax, "jax" and "mujoco" are the same scan with pictures drawn by either, in turns, and
-"ratio" is the first over the second; "drawing_jax" and "drawing_mujoco" are the shares of the time
-that go into pictures: of as many pictures drawn alone, or that passes while the processes draw.
+quotient. For Brax, "jax" and "mujoco" are the same scan with pictures drawn by either, in turns,
+and "ratio" is the first over the second; "drawing_jax" and "drawing_mujoco" are the shares of the
+time that go into pictures: of as many drawn alone, or that passes while the processes draw.
 Rates are the best of the repetitions.
 """
 

@@ -61,7 +61,7 @@ _PUSH = {"InvertedPendulum": 300.0, "InvertedDoublePendulum": 200.0}
 
 
 @contextlib.contextmanager
-def _quiet():
+def quiet():
     """Keeps what Brax has to say of its age, and of MuJoCo's, to itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -94,6 +94,11 @@ class _Swingup(PipelineEnv):
         return state.replace(pipeline_state=physics, reward=jnp.cos(physics.q[1:]).sum())
 
 
+def brax_state(state: Any) -> State:
+    """The engine's state as one of Brax's environments."""
+    return State(state, None, jnp.float32(0), jnp.float32(0), {}, {})
+
+
 class Physics:
     """One task's dynamics as pure functions of Brax's state.
 
@@ -101,6 +106,7 @@ class Physics:
         action_size: |A|.
         positions: Q.
         seconds: simulated time of one `step`.
+        env: Brax's environment.
 
     Args:
         title: one of the six names of the thesis, such as "Walker2D".
@@ -109,12 +115,13 @@ class Physics:
 
     def __init__(self, title: str, backend: str):
         steps = _PHYSICS_STEPS[title][backend in _SHORT_STEPS]
-        with _quiet():
+        with quiet():
             if title in _BRAX_NAMES:
                 env = get_environment(_BRAX_NAMES[title], backend=backend, n_frames=steps)
             else:
                 env = _Swingup(title, backend, steps)
-        self._env = env
+        self.env = env
+        self.backend = backend
         self._free = env.sys.link_types[0] == "f"
         self.action_size = env.action_size
         self.positions = env.sys.q_size()
@@ -122,8 +129,8 @@ class Physics:
 
     def start(self, key: jax.Array) -> Any:
         """The state in which an episode starts."""
-        with _quiet():
-            return self._env.reset(key).pipeline_state
+        with quiet():
+            return self.env.reset(key).pipeline_state
 
     def step(self, state: Any, action: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
         """Advance by one environment step with `action` (float32 [|A|], clipped to [-1, 1]).
@@ -132,12 +139,15 @@ class Physics:
             The state, the reward and whether the episode ended. A state in which the engine
             has diverged ends it too, without reward, and is replaced by the one before.
         """
-        before = State(state, None, jnp.float32(0), jnp.float32(0), {}, {})
-        with _quiet():
-            after = self._env.step(before, jnp.clip(action, -1.0, 1.0))
+        with quiet():
+            after = self.env.step(brax_state(state), jnp.clip(action, -1.0, 1.0))
+        return self.judged(state, after)
+
+    def judged(self, before: Any, after: State) -> tuple[Any, jax.Array, jax.Array]:
+        """What `step` returns, of the state before and of what Brax's environment makes of it."""
         new, reward = after.pipeline_state, jnp.float32(after.reward)
         finite = jnp.isfinite(jnp.concatenate([new.q, new.qd, reward[None]])).all()
-        new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, state)
+        new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, before)
         return new, jnp.where(finite, reward, 0.0), ~finite | (after.done > 0.5)
 
     def hold(self, state: Any, action: jax.Array, repeat: int):
@@ -171,7 +181,7 @@ def physics_of(title: str, backend: str) -> Physics:
 @functools.cache
 def task_scene(title: str) -> Scene:
     """What `envs.ray_casting` draws of a task, nearly as MuJoCo does."""
-    with _quiet():
+    with quiet():
         model = mujoco.MjModel.from_xml_string(mjcf.fuse_bodies(painted_xml(title)))
     scene = scene_of(model)
     # MuJoCo lights a floor at points that are 40 m apart, and so sees no edge of the pendula's

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Outcome, SimulatorError, TaskSpec, TimeStep
+from envs.brax_episodes import episodes_of
 from envs.brax_physics import physics_of, task_scene
 from envs.bridge import HostCalls
 from envs.pool import SimulatorPool
@@ -85,8 +86,11 @@ class BraxEnv:
         self.action_repeat = action_repeat
         self.action_size = action_size
         self._physics = [physics_of(task.title, task.physics) for task in self.tasks]
+        self._episodes = [episodes_of(physics, action_repeat) for physics in self._physics]
+        keys = jax.eval_shape(_typed, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
         self._layouts = [
-            Layout(jax.eval_shape(physics.start, jax.random.key(0))) for physics in self._physics
+            Layout(jax.tree.map(_row, jax.eval_shape(episodes.begin, keys)))
+            for episodes in self._episodes
         ]
         self._words = max(layout.size for layout in self._layouts)
         self._reset = mapped_rows(self._reset_rows)
@@ -146,38 +150,25 @@ class BraxEnv:
     def _begin(self, task: int, rows):
         """States of task number `task` that start episodes, and their views, for (keys,
         episodes)."""
-        words = self._start(task, rows)
-        return words, self._views(task, words)
-
-    def _start(self, task: int, rows) -> jax.Array:
-        keys, episodes = rows
-        episode_keys = jax.vmap(jax.random.fold_in)(_typed(keys), episodes)
-        return self._packed(task, jax.vmap(self._physics[task].start)(episode_keys))
-
-    def _packed(self, task: int, states) -> jax.Array:
-        return jax.vmap(lambda state: self._layouts[task].pack(state, self._words))(states)
+        return self._seen(task, self._episodes[task].begin(_episode_keys(*rows)))
 
     @functools.partial(jax.jit, static_argnums=(0, 1))
     def _tick(self, task: int, rows):
         """One tick of task number `task`: states, views, rewards, terminal."""
         keys, next_episodes, ended, words, actions = rows
-        physics = self._physics[task]
         states = jax.vmap(self._layouts[task].unpack)(words)
-        hold = functools.partial(physics.hold, repeat=self.action_repeat)
-        states, rewards, terminal = jax.vmap(hold)(states, actions[:, : physics.action_size])
-        moved = self._packed(task, states)
+        actions = actions[:, : self._physics[task].action_size]
+        keys = _episode_keys(keys, next_episodes)
+        states, rewards, terminal = self._episodes[task].tick(states, actions, ended, keys)
+        return *self._seen(task, states), rewards, terminal
 
-        def restarted():
-            return jnp.where(ended[:, None], self._start(task, (keys, next_episodes)), moved)
+    def _seen(self, task: int, states) -> tuple[jax.Array, jax.Array]:
+        """The words of states of task number `task`, int32 [n, W], and their views."""
+        words = jax.vmap(lambda state: self._layouts[task].pack(state, self._words))(states)
+        return words, self._views(task, self._episodes[task].physics_state(states))
 
-        # Falls are rare, and a start costs as much as a step.
-        words = jax.lax.cond(ended.any(), restarted, lambda: moved)
-        views = self._views(task, words)
-        return words, views, jnp.where(ended, 0.0, rewards), terminal & ~ended
-
-    def _views(self, task: int, words: jax.Array) -> jax.Array:
-        """What there is to see of states [n, W] of task number `task`: here, the images."""
-        states = jax.vmap(self._layouts[task].unpack)(words)
+    def _views(self, task: int, states) -> jax.Array:
+        """What there is to see of Brax's states of task number `task`: here, the images."""
         scene, spec = task_scene(self.tasks[task].title), self.tasks[task]
 
         def drawn(state):
@@ -245,9 +236,8 @@ class HostDrawnBraxEnv(BraxEnv):
         jax.effects_barrier()
         self._pool.close()
 
-    def _views(self, task: int, words: jax.Array) -> jax.Array:
-        """Joint positions float32 [n, Q] of states [n, W] of task number `task`."""
-        states = jax.vmap(self._layouts[task].unpack)(words)
+    def _views(self, task: int, states) -> jax.Array:
+        """Joint positions float32 [n, Q] of Brax's states of task number `task`."""
         missing = self._positions - self._physics[task].positions
         return jnp.pad(states.q, ((0, 0), (0, missing)))
 
@@ -281,6 +271,15 @@ def _phase_key(words: jax.Array) -> jax.Array:
 
 def _typed(keys: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(keys, impl="threefry2x32")
+
+
+def _episode_keys(keys: jax.Array, episodes: jax.Array) -> jax.Array:
+    return jax.vmap(jax.random.fold_in)(_typed(keys), episodes)
+
+
+def _row(shape: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    """The shape of one of n."""
+    return jax.ShapeDtypeStruct(shape.shape[1:], shape.dtype)
 
 
 def _drawing(task: TaskSpec) -> TaskSpec:
