@@ -6,6 +6,7 @@ containers), alone or stacked as a population, under ``jit`` and ``vmap``.
 Axis letters, used everywhere: P population member, N source, M feature, S sample.
 """
 
+from transfer.execution import OPERATIONS, apply, source_leaves, stream
 from transfer.files import load, save
 from transfer.freeze import (
     combine,
@@ -15,13 +16,23 @@ from transfer.freeze import (
     stop_gradient,
     unfreeze_gradually,
 )
-from transfer.plan import OPERATIONS, Plan, Rule, apply, claims, frozen, source_leaves
+from transfer.merging import (
+    breadcrumbs,
+    dare,
+    karcher_mean,
+    model_stock,
+    slerp,
+    task_arithmetic,
+    ties,
+)
+from transfer.plan import Plan, Rule, claims, frozen
 from transfer.plan_files import read_plan, write_plan
 from transfer.population import replicate, stack, unstack
 from transfer.report import Report
 from transfer.select import (
     complement,
     difference,
+    escape,
     flatten,
     intersection,
     paths,
@@ -50,20 +61,25 @@ __all__ = [
     "Rule",
     "apply",
     "average",
+    "breadcrumbs",
     "claims",
     "combine",
     "complement",
     "copy",
     "crop",
+    "dare",
     "difference",
+    "escape",
     "flatten",
     "fraction",
     "freeze",
     "frozen",
     "interpolate",
     "intersection",
+    "karcher_mean",
     "keep",
     "load",
+    "model_stock",
     "pad",
     "partition",
     "paths",
@@ -74,11 +90,15 @@ __all__ = [
     "scale_learning_rates",
     "select",
     "shrink_perturb",
+    "slerp",
     "source_leaves",
     "splice",
     "stack",
     "stop_gradient",
+    "stream",
     "take",
+    "task_arithmetic",
+    "ties",
     "unflatten",
     "unfreeze_gradually",
     "union",

@@ -1,17 +1,24 @@
-"""Which leaves of a pytree: '/'-joined paths, glob patterns and masks.
+r"""Which leaves of a pytree: '/'-joined paths, glob patterns and masks.
 
 A leaf's *path* is its JAX key path joined by '/': ``reward/out/kernel`` in nested dictionaries,
 ``layers/0/weight`` in an Equinox module, ``0/mu/reward/out/kernel`` in the state of an Optax chain.
 The box that Flax NNX puts around an array (``nnx.Variable``) is not part of the path, so the same
-layer has the same path in linen and in NNX.
+layer has the same path in linen and in NNX. An array that an NNX module holds in two places (tied
+weights) is one leaf, as in ``nnx.state``: it has the path of the first place, and what changes it
+changes both.
 
 A *pattern* is a glob over the parts of a path:
 
-====================  ======================================================
-``reward/out/*``      ``*`` and ``?`` and ``[ab]`` match inside one part
-``dynamics/**``       ``**`` stands for any number of parts, none included
-``!dynamics/gru/*``   ``!`` takes leaves away from what came before it
-====================  ======================================================
+=======================  ========================================================
+``reward/out/*``         ``*`` and ``?`` and ``[ab]`` match inside one part
+``dynamics/**``          ``**`` stands for any number of parts, none included
+``layers/{i}/kernel``    ``{i}`` matches as ``*`` does, one character at least, and
+                         is remembered by its name; ``{i:**}`` matches as ``**``
+``!dynamics/gru/*``      ``!`` takes leaves away from what came before it
+``w\[0\]``, ``\!w``    a backslash makes the next character an ordinary one
+=======================  ========================================================
+
+:func:`escape` writes the pattern of one path, whatever characters it holds.
 
 A *mask* is the same pytree with a ``bool`` in place of every leaf. Selections are static: they
 depend on the structure of a tree and never on its values, so they cost nothing under ``jit``.
@@ -21,13 +28,15 @@ an Equinox module) are settings: they have no path, no mask selects them, no ope
 """
 
 import difflib
-import fnmatch
+import functools
+import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 PyTree = Any
 Mask = Any
@@ -46,23 +55,51 @@ def _is_nnx_variable(node: Any) -> bool:
     return nnx is not None and isinstance(node, nnx.Variable)
 
 
-def _entries(tree: PyTree) -> list[tuple[str, Any]]:
-    """(path, leaf) of every JAX leaf in tree order, those that are not arrays included."""
+class Leaves(Mapping[str, Any]):
+    """A flat ``{path: array}`` whose arrays are made when they are asked for, such as a file's.
+
+    Every operation takes one as a source. A subclass has ``shapes``, which say what is there
+    without making it.
+    """
+
+    @property
+    def shapes(self) -> Mapping[str, jax.ShapeDtypeStruct]:
+        """Shape and dtype of every array, by path."""
+        raise NotImplementedError
+
+
+class _Entry(NamedTuple):
+    """A JAX leaf of a tree. ``tied``: the same array came before, under this path."""
+
+    path: str
+    leaf: Any
+    tied: bool = False
+
+
+def _entries(tree: PyTree) -> list[_Entry]:
+    """Every JAX leaf in tree order, those that are not arrays included."""
     boxes, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_nnx_variable)
-    entries = []
+    entries: list[_Entry] = []
+    first_of: dict[int, list[_Entry]] = {}
     for key_path, box in boxes:
         path = jax.tree_util.keystr(key_path, simple=True, separator="/")
         if not _is_nnx_variable(box):
-            entries.append((path, box))
+            entries.append(_Entry(path, box))
+            continue
+        if id(box) in first_of:
+            entries += [entry._replace(tied=True) for entry in first_of[id(box)]]
             continue
         inner, _ = jax.tree_util.tree_flatten_with_path(box)
-        for inner_path, leaf in inner:
-            name = jax.tree_util.keystr(inner_path, simple=True, separator="/")
-            entries.append((path if len(inner) == 1 else f"{path}/{name}", leaf))
+        names = [jax.tree_util.keystr(key, simple=True, separator="/") for key, _ in inner]
+        first_of[id(box)] = [
+            _Entry(path if len(inner) == 1 else f"{path}/{name}", leaf)
+            for name, (_, leaf) in zip(names, inner, strict=True)
+        ]
+        entries += first_of[id(box)]
     return entries
 
 
-def flatten(tree: PyTree) -> dict[str, Any]:
+def flatten(tree: PyTree) -> Mapping[str, Any]:
     """Every array of a tree by its path, in tree order.
 
     The result is itself a valid source for every operation, which looks its leaves up by path:
@@ -74,10 +111,13 @@ def flatten(tree: PyTree) -> dict[str, Any]:
     >>> flatten({"actor": {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}}).keys()
     dict_keys(['actor/bias', 'actor/kernel'])
     """
-    entries = [(path, leaf) for path, leaf in _entries(tree) if is_array(leaf)]
-    flat = dict(entries)
+    if isinstance(tree, Leaves):
+        return tree
+    entries = [entry for entry in _entries(tree) if is_array(entry.leaf) and not entry.tied]
+    flat = {entry.path: entry.leaf for entry in entries}
     if len(flat) < len(entries):
-        twice = sorted(path for path, n in Counter(path for path, _ in entries).items() if n > 1)
+        counts = Counter(entry.path for entry in entries)
+        twice = sorted(path for path, count in counts.items() if count > 1)
         raise ValueError(
             f"Two leaves of the tree have the same path: {', '.join(twice)}. "
             "Rename a key that holds a '/'."
@@ -85,8 +125,10 @@ def flatten(tree: PyTree) -> dict[str, Any]:
     return flat
 
 
-def unflatten(tree: PyTree, leaves: dict[str, Any]) -> PyTree:
+def unflatten(tree: PyTree, leaves: Mapping[str, Any]) -> PyTree:
     """``tree`` with the leaves named in ``leaves`` put in place of its own.
+
+    Tied weights of NNX modules stay tied.
 
     Raises:
         ValueError: a name in ``leaves`` is no path of the tree.
@@ -94,14 +136,34 @@ def unflatten(tree: PyTree, leaves: dict[str, Any]) -> PyTree:
     >>> unflatten({"a": jnp.zeros(2), "b": jnp.zeros(2)}, {"b": jnp.ones(2)})
     {'a': Array([0., 0.], dtype=float32), 'b': Array([1., 1.], dtype=float32)}
     """
-    names = set(flatten(tree))
+    entries = _entries(tree)
+    names = {entry.path for entry in entries if is_array(entry.leaf)}
     for path in leaves:
         if path not in names:
             raise ValueError(f"The tree has no leaf {path!r}{suggest(path, names)}.")
-    new = [
-        leaves[path] if is_array(leaf) and path in leaves else leaf for path, leaf in _entries(tree)
-    ]
-    return jax.tree.unflatten(jax.tree.structure(tree), new)
+    return _rebuild(
+        tree,
+        [
+            leaves[entry.path] if is_array(entry.leaf) and entry.path in leaves else entry.leaf
+            for entry in entries
+        ],
+    )
+
+
+def _rebuild(tree: PyTree, leaves: Sequence[Any]) -> PyTree:
+    """The tree with other JAX leaves. What it holds twice, it holds twice again."""
+    boxes, outer = jax.tree.flatten(tree, is_leaf=_is_nnx_variable)
+    if not any(map(_is_nnx_variable, boxes)):
+        return outer.unflatten(leaves)
+    remaining, filled, made = iter(leaves), [], {}
+    for box in boxes:
+        if not _is_nnx_variable(box):
+            filled.append(next(remaining))
+            continue
+        inner = jax.tree.structure(box)
+        new = inner.unflatten([next(remaining) for _ in range(inner.num_leaves)])
+        filled.append(made.setdefault(id(box), new))
+    return outer.unflatten(filled)
 
 
 def paths(tree: PyTree) -> tuple[str, ...]:
@@ -114,48 +176,211 @@ def paths(tree: PyTree) -> tuple[str, ...]:
 
 
 def match(pattern: str, path: str) -> bool:
-    """Whether a glob pattern (without ``!``) matches a whole path.
+    """Whether a pattern (without a leading ``!``) matches a whole path.
 
     >>> match("dynamics/**/kernel", "dynamics/prior/out/kernel"), match("*/out", "reward/out/bias")
     (True, False)
     """
-    return _match_parts(pattern.split("/"), path.split("/") if path else [])
+    return captures(pattern, path) is not None
 
 
-def _match_parts(pattern: list[str], path: list[str]) -> bool:
-    if not pattern:
-        return not path
-    if pattern[0] == "**":
-        return any(_match_parts(pattern[1:], path[skip:]) for skip in range(len(path) + 1))
-    if not path or not fnmatch.fnmatchcase(path[0], pattern[0]):
-        return False
-    return _match_parts(pattern[1:], path[1:])
+def captures(pattern: str, path: str) -> dict[str, str] | None:
+    """What the named parts of a pattern stand for in a path; ``None`` if it does not match.
+
+    A name that comes twice stands for the same text twice. Of several ways to match, each
+    wildcard takes as few parts as it can, the first of them first.
+
+    Raises:
+        ValueError: a pattern that cannot be read, such as ``{1st}``.
+
+    >>> captures("layers/{i}/{rest:**}", "layers/3/attention/kernel")
+    {'i': '3', 'rest': 'attention/kernel'}
+    """
+    wanted = [_part(part) for part in pattern.split("/")]
+    parts = path.split("/") if path else []
+    found: dict[str, str] = {}
+    at = position = 0
+    # Where to go on after a mismatch: the last "**" takes one part more. One such place is enough,
+    # as for the "*" of a file name, so no pattern takes more than parts x parts comparisons.
+    retry: tuple[int, int, int, dict[str, str]] | None = None
+    while True:
+        if at < len(wanted) and isinstance(wanted[at], _Several):
+            retry = (at, position, position, dict(found))
+            found = _with(found, wanted[at].name, "")
+        elif at < len(wanted) and position < len(parts):
+            hit = wanted[at].fullmatch(parts[position])
+            named = found if hit is None else _merged(found, hit.groupdict())
+            if hit is not None and named is not None:
+                found, at, position = named, at + 1, position + 1
+                continue
+            found = None
+        else:
+            found = found if at == len(wanted) and position == len(parts) else None
+            if found is not None:
+                return found
+        if found is not None:
+            at += 1
+            continue
+        if retry is None or retry[2] >= len(parts):
+            return None
+        at, start, end, before = retry
+        retry = (at, start, end + 1, before)
+        position = end + 1
+        found = _with(before, wanted[at].name, "/".join(parts[start:position]))
+        at += 1
+
+
+class _Several(NamedTuple):
+    """``**``, or ``{name:**}``."""
+
+    name: str | None
+
+
+def _with(found: dict[str, str], name: str | None, value: str) -> dict[str, str]:
+    return found if name is None else {**found, name: value}
+
+
+def _merged(found: dict[str, str], new: dict[str, str]) -> dict[str, str] | None:
+    """Both together, or ``None`` where they differ."""
+    if any(found.get(name, value) != value for name, value in new.items()):
+        return None
+    return {**found, **new}
+
+
+_NAMED = re.compile(r"\{([^{}/]*)\}")
+
+
+@functools.lru_cache(maxsize=4096)
+def _part(part: str) -> "re.Pattern[str] | _Several":
+    """One part of a pattern as a regular expression that never goes back."""
+    if part == "**":
+        return _Several(None)
+    named = _NAMED.fullmatch(part)
+    if named and named[1].endswith(":**"):
+        return _Several(_checked_name(part, named[1].removesuffix(":**")))
+    # Text and wildcards in turn. Each wildcard with the text behind it is an atomic group: the
+    # first place where the text fits is as good as any later one.
+    pieces: list[tuple[str | None, str]] = [(None, "")]
+    seen: set[str] = set()
+    index = 0
+    while index < len(part):
+        character, rest = part[index], part[index:]
+        wildcard, text, length = None, re.escape(character), 1
+        if character == "\\" and len(rest) > 1:
+            text, length = re.escape(rest[1]), 2
+        elif character == "*":
+            wildcard, text = ".*", ""
+        elif character == "?":
+            text = "."
+        elif character == "[" and (end := _end_of_class(rest)):
+            inside = rest[1:end].replace("\\", "\\\\").replace("[", "\\[")
+            inside = "^" + inside[1:] if inside.startswith("!") else re.sub(r"^\^", r"\\^", inside)
+            text, length = f"[{inside}]", end + 1
+        elif character == "{" and (named := _NAMED.match(rest)):
+            name, length = _checked_name(part, named[1]), named.end()
+            wildcard, text = (f"(?P<{name}>.+)", "") if name not in seen else (None, f"(?P={name})")
+            seen.add(name)
+        if wildcard is None:
+            pieces[-1] = (pieces[-1][0], pieces[-1][1] + text)
+        else:
+            pieces.append((wildcard, ""))
+        index += length
+    expression = pieces[0][1]
+    for number, (wildcard, text) in enumerate(pieces[1:], start=2):
+        if number < len(pieces):
+            lazy = wildcard.replace(".*", ".*?").replace(".+", ".+?")
+            expression += f"(?>{lazy}{text})" if text else f"(?>{lazy})"
+        else:
+            expression += wildcard + text
+    try:
+        return re.compile(expression, re.DOTALL)
+    except re.error as error:
+        raise ValueError(f"The pattern {part!r} cannot be read: {error}.") from None
+
+
+def _end_of_class(text: str) -> int | None:
+    """The place of the bracket that closes the class which ``text`` begins with."""
+    end = text.find("]", 3 if text.startswith("[!") else 2)
+    return end if end > 0 else None
+
+
+def _checked_name(part: str, name: str) -> str:
+    if not name.isidentifier():
+        raise ValueError(
+            f"The pattern {part!r} names a part {name!r}; expected a word, as in {{layer}} or "
+            "{rest:**}. An ordinary brace is written \\{."
+        )
+    return name
+
+
+def escape(path: str) -> str:
+    r"""The pattern that matches exactly this path, whatever characters its keys hold.
+
+    >>> print(escape("w[0]/*"), escape("!b"))
+    w\[0]/\* \!b
+    """
+    escaped = re.sub(r"([\\*?\[{])", r"\\\1", path)
+    return "\\" + escaped if escaped.startswith("!") else escaped
 
 
 def suggest(pattern: str, names: Iterable[str]) -> str:
     """Near misses for an error message: leaves, and branches written as ``branch/**``."""
     names = list(names)
-    branches = {
-        "/".join(name.split("/")[:depth]) + "/**"
-        for name in names
-        for depth in range(1, name.count("/") + 1)
-    }
-    near = difflib.get_close_matches(pattern.lstrip("!"), [*names, *sorted(branches)], n=4)
+    branches = sorted(
+        {
+            "/".join(name.split("/")[:depth])
+            for name in names
+            for depth in range(1, name.count("/") + 1)
+        }
+    )
+    wanted = pattern.removeprefix("!")
+    if wanted.rstrip("/") in branches:
+        return f"; did you mean {escape(wanted.rstrip('/'))}/**?"
+    choices = {name: escape(name) for name in names}
+    choices |= {f"{branch}/**": f"{escape(branch)}/**" for branch in branches}
+    # A bracket or star that stands for itself is the likeliest miss of all.
+    if wanted in names:
+        near = [wanted]
+    else:
+        near = difflib.get_close_matches(wanted, choices, n=4)
     if near:
-        return f"; did you mean {', '.join(near)}?"
+        return f"; did you mean {', '.join(choices[name] for name in near)}?"
     listed = ", ".join(names[:8]) + (f", ... ({len(names)} in all)" if len(names) > 8 else "")
     return f"; the leaves are {listed or 'none'}"
 
 
-def match_paths(names: Sequence[str], *patterns: str, optional: bool = False) -> frozenset[str]:
+def pattern_list(patterns: Sequence[Any]) -> tuple[str, ...]:
+    """Patterns given one by one or as lists, as one tuple.
+
+    Raises:
+        ValueError: what is given is no string, or nothing is given.
+    """
+    found: list[str] = []
+    for pattern in patterns:
+        found += [pattern] if isinstance(pattern, str) or not _is_list(pattern) else pattern
+    for pattern in found:
+        if not isinstance(pattern, str):
+            raise ValueError(
+                f"A pattern is a string such as 'encoder/**'; got {pattern!r} "
+                f"({type(pattern).__name__})."
+            )
+    if not found:
+        raise ValueError("No pattern was given; '**' selects every leaf.")
+    return tuple(found)
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list | tuple | set | frozenset)
+
+
+def match_paths(names: Sequence[str], *patterns: Any, optional: bool = False) -> frozenset[str]:
     """The names among ``names`` that the patterns select, taken in order.
 
     Raises:
         ValueError: a pattern matches no name at all, unless ``optional``; the message lists near
             misses.
     """
-    if not patterns:
-        raise ValueError("No pattern was given; '**' selects every leaf.")
+    patterns = pattern_list(patterns)
     chosen: set[str] = set(names) if patterns[0].startswith("!") else set()
     for pattern in patterns:
         found = {name for name in names if match(pattern.removeprefix("!"), name)}
@@ -165,13 +390,14 @@ def match_paths(names: Sequence[str], *patterns: str, optional: bool = False) ->
     return frozenset(chosen)
 
 
-def select(tree: PyTree, *patterns: str, count: int | None = None) -> Mask:
+def select(tree: PyTree, *patterns: str | Sequence[str], count: int | None = None) -> Mask:
     """A mask of the leaves whose paths match the patterns.
 
     Args:
         tree: any pytree; of its arrays only the paths are read.
-        *patterns: glob patterns, applied in order: a plain one adds leaves, one that begins with
-            ``!`` takes them away. If the first begins with ``!``, all leaves are the start.
+        *patterns: glob patterns, or lists of them, applied in order: a plain one adds leaves, one
+            that begins with ``!`` takes them away. If the first begins with ``!``, all leaves are
+            the start.
         count: the number of leaves there ought to be.
 
     Returns:
@@ -189,7 +415,7 @@ def select(tree: PyTree, *patterns: str, count: int | None = None) -> Mask:
     if count is not None and len(chosen) != count:
         listed = ", ".join(name for name in names if name in chosen) or "none"
         raise ValueError(
-            f"Patterns {', '.join(map(repr, patterns))} select {len(chosen)} leaves, "
+            f"Patterns {', '.join(map(repr, pattern_list(patterns)))} select {len(chosen)} leaves, "
             f"expected {count}: {listed}."
         )
     return mask_of(tree, chosen)
@@ -198,8 +424,8 @@ def select(tree: PyTree, *patterns: str, count: int | None = None) -> Mask:
 def mask_of(tree: PyTree, chosen: Iterable[str]) -> Mask:
     """The mask that is ``True`` at exactly the given paths."""
     chosen = frozenset(chosen)
-    flags = [is_array(leaf) and path in chosen for path, leaf in _entries(tree)]
-    return jax.tree.unflatten(jax.tree.structure(tree), flags)
+    flags = [is_array(entry.leaf) and entry.path in chosen for entry in _entries(tree)]
+    return _rebuild(tree, flags)
 
 
 def selected(tree: PyTree, where: Where = None) -> frozenset[str]:
@@ -220,15 +446,47 @@ def selected(tree: PyTree, where: Where = None) -> frozenset[str]:
         return frozenset(names)
     if isinstance(where, str):
         return match_paths(names, where)
-    if isinstance(where, tuple | list) and where and all(isinstance(p, str) for p in where):
+    if _is_list(where) and all(isinstance(pattern, str) for pattern in where):
         return match_paths(names, *where)
     same_structure("the mask", where, "the tree", tree)
+    entries = _entries(tree)
     flags = jax.tree.leaves(where)
+    for entry, flag in zip(entries, flags, strict=True):
+        if isinstance(flag, jax.core.Tracer) or not isinstance(flag, bool | np.bool_ | jax.Array):
+            raise ValueError(
+                f"{entry.path}: a mask holds True or False, known before tracing; got {flag!r}."
+            )
     return frozenset(
-        path
-        for (path, leaf), flag in zip(_entries(tree), flags, strict=True)
-        if is_array(leaf) and bool(flag)
+        entry.path
+        for entry, flag in zip(entries, flags, strict=True)
+        if is_array(entry.leaf) and bool(flag)
     )
+
+
+def split(tree: PyTree, chosen: Iterable[str]) -> tuple[PyTree, PyTree]:
+    """The tree with only the chosen leaves, and with all others; ``None`` for what is left out."""
+    chosen = frozenset(chosen)
+    entries = _entries(tree)
+    flags = [is_array(entry.leaf) and entry.path in chosen for entry in entries]
+    pairs = list(zip(entries, flags, strict=True))
+    first = _rebuild(tree, [entry.leaf if flag else None for entry, flag in pairs])
+    return first, _rebuild(tree, [None if flag else entry.leaf for entry, flag in pairs])
+
+
+def join(choose: Callable[..., Any], parts: Sequence[PyTree]) -> PyTree:
+    """``choose`` of the leaves of trees from :func:`split`, ``None`` being a leaf."""
+    is_box = lambda node: node is None or _is_nnx_variable(node)  # noqa: E731
+    flat = [jax.tree.flatten(part, is_leaf=is_box) for part in parts]
+    if len({structure for _, structure in flat}) != 1:
+        raise ValueError("The parts have different structures.")
+    made: dict[tuple[int, ...], Any] = {}
+    boxes = []
+    for together in zip(*(boxes for boxes, _ in flat), strict=True):
+        whole = jax.tree.map(choose, *together, is_leaf=lambda leaf: leaf is None)
+        # What every part holds twice stays one thing.
+        key = tuple(map(id, together))
+        boxes.append(made.setdefault(key, whole) if _is_nnx_variable(together[0]) else whole)
+    return flat[0][1].unflatten(boxes)
 
 
 def same_structure(name: str, tree: PyTree, other_name: str, other: PyTree) -> None:
