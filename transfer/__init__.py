@@ -7,7 +7,7 @@ Axis letters, used everywhere: P population member, N source, M feature, S sampl
 """
 
 from transfer.execution import OPERATIONS, apply, source_leaves, stream
-from transfer.files import load, save
+from transfer.files import load, open_file, save
 from transfer.freeze import (
     combine,
     freeze,
@@ -35,8 +35,10 @@ from transfer.select import (
     escape,
     flatten,
     intersection,
+    match,
     paths,
     select,
+    selected,
     unflatten,
     union,
 )
@@ -79,7 +81,9 @@ __all__ = [
     "karcher_mean",
     "keep",
     "load",
+    "match",
     "model_stock",
+    "open_file",
     "pad",
     "partition",
     "paths",
@@ -89,6 +93,7 @@ __all__ = [
     "save",
     "scale_learning_rates",
     "select",
+    "selected",
     "shrink_perturb",
     "slerp",
     "source_leaves",

@@ -187,7 +187,8 @@ def scale_learning_rates(
     Args:
         optimizer: the optimiser; its update of a leaf is scaled, whatever it consists of.
         multipliers: pattern, or a tuple of patterns as :func:`transfer.select` takes them ->
-            factor, a scalar that may be traced. Leaves that no pattern names have factor 1. For a factor of 0 use :func:`freeze`, which keeps no memory.
+            factor, a scalar that may be traced. Leaves that no pattern names have factor 1. For a
+            factor of 0 use :func:`freeze`, which keeps no memory.
 
     Raises:
         ValueError: at the first update, where a pattern matches nothing or two match one leaf.

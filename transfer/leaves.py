@@ -6,6 +6,7 @@ they are concrete; inside a traced function only shapes and dtypes can be.
 Axis letters: P population member.
 """
 
+import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
@@ -245,15 +246,16 @@ def cast(path: str, result: Array, target: Array, *, casting: str = "same_kind")
             "is set; set it, or convert the target first."
         )
     if result.dtype != dtype:
-        result = result.astype(dtype)
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            # What is lost is known by now, or was asked for.
+            warnings.simplefilter("ignore")
+            result = result.astype(dtype)
     sharding = _sharding(target)
     if not isinstance(result, jax.Array):
         result = jnp.array(result, copy=True)
     if sharding is None or not is_concrete(result):
         return result
-    if result.sharding.is_equivalent_to(sharding, result.ndim):
-        return result
-    return jax.device_put(result, sharding)
+    return result if result.sharding == sharding else jax.device_put(result, sharding)
 
 
 def _sharding(leaf: Array) -> jax.sharding.Sharding | None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from transfer.leaves import is_key, wide_dtype
+from transfer.leaves import beside, is_key, wide_dtype
 from transfer.select import PyTree
 
 Array = Any
@@ -274,6 +274,7 @@ def measure_leaves(
         population: whether leaves are stacked on a leading axis P.
     """
     before, after, source = map(_numbers, (before, after, source))
+    source = {path: beside(leaf, after[path]) for path, leaf in source.items()}
     comparable = {path: x for path, x in source.items() if x.shape == after[path].shape}
     return _measure(before, after, source, comparable, population=population)
 

@@ -15,7 +15,7 @@ A *pattern* is a glob over the parts of a path:
 ``layers/{i}/kernel``    ``{i}`` matches as ``*`` does, one character at least, and
                          is remembered by its name; ``{i:**}`` matches as ``**``
 ``!dynamics/gru/*``      ``!`` takes leaves away from what came before it
-``w\[0\]``, ``\!w``    a backslash makes the next character an ordinary one
+``w\[0]``, ``\!w``     a backslash makes the next character an ordinary one
 =======================  ========================================================
 
 :func:`escape` writes the pattern of one path, whatever characters it holds.
