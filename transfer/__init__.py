@@ -16,7 +16,9 @@ from transfer.freeze import (
     stop_gradient,
     unfreeze_gradually,
 )
+from transfer.mergekit import read_mergekit
 from transfer.merging import (
+    average,
     breadcrumbs,
     dare,
     karcher_mean,
@@ -43,7 +45,6 @@ from transfer.select import (
     union,
 )
 from transfer.surgery import (
-    average,
     copy,
     crop,
     fraction,
@@ -87,6 +88,7 @@ __all__ = [
     "pad",
     "partition",
     "paths",
+    "read_mergekit",
     "read_plan",
     "reinitialise",
     "replicate",

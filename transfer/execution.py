@@ -35,7 +35,7 @@ OPERATIONS: Operations = {
         surgery.splice,
         surgery.pad,
         surgery.crop,
-        surgery.average,
+        merging.average,
         merging.slerp,
         merging.task_arithmetic,
         merging.ties,
@@ -560,14 +560,16 @@ def _gradient(rule: Rule, name: str, value: Mapping, mine: Sequence[str]) -> dic
         )
     order = sorted(set(depths.values()), key=natural)
     values = value["values"]
-    if not np.ndim(values) == 1 or not np.size(values):
+    knots = [jnp.asarray(knot, jnp.float32) for knot in values] if np.ndim(values) else []
+    if not knots:
         raise ValueError(f"{name} of the rule '{rule}' needs a list of values, got {values!r}.")
-    at = jnp.linspace(0.0, 1.0, len(values)) if len(values) > 1 else jnp.zeros(1)
-    places = {depth: i / max(1, len(order) - 1) for i, depth in enumerate(order)}
-    spread = jnp.interp(
-        jnp.array([places[depth] for depth in order]), at, jnp.asarray(values, jnp.float32)
-    )
-    return {path: spread[order.index(depth)] for path, depth in depths.items()}
+    spread = {}
+    for number, depth in enumerate(order):
+        at = number / max(1, len(order) - 1) * (len(knots) - 1)
+        low = min(int(at), max(0, len(knots) - 2))
+        high = min(low + 1, len(knots) - 1)
+        spread[depth] = (1 - (at - low)) * knots[low] + (at - low) * knots[high]
+    return {path: spread[depth] for path, depth in depths.items()}
 
 
 def _signature(rule: Rule, operations: Operations) -> Mapping[str, inspect.Parameter]:

@@ -29,6 +29,7 @@ from transfer.leaves import (
     check_shape,
     draw,
     find,
+    is_concrete,
     numbers,
     numeric,
     wide,
@@ -54,6 +55,7 @@ def _merge(
     where: Where,
     population: bool,
     key: jax.Array | None = None,
+    reads_target: bool = True,
     **given: _Number,
 ) -> PyTree:
     """``formula(base, models, *numbers)`` of each leaf, in float32 at least.
@@ -77,7 +79,7 @@ def _merge(
         for other in others:
             check_shape(path, leaf, other)
             check_casting(path, other, leaf, "same_kind")
-        base = wide(path, leaf)
+        base = wide(path, leaf if reads_target else others[0])
         # [P, N, ...] for a population, so that members are mapped and sources follow.
         axis = 1 if population else 0
         models = jnp.stack([wide(path, other) for other in others], axis=axis)
@@ -114,6 +116,51 @@ def _shaped(path, name, number: _Number, value, base, count: int, members: int):
     if not members and len(shape) == len(per_source) + 1:
         hint = "; for one value per member of a population say population=True"
     raise ValueError(f"{path}: {name} has shape {shape}; expected {wanted}{hint}.")
+
+
+def average(
+    target: PyTree,
+    sources: Sequence[PyTree],
+    *,
+    weights: Any = 1.0,
+    normalise: bool = True,
+    population: bool = False,
+    where: Where = None,
+) -> PyTree:
+    """Σ w_n θ_n / Σ w_n, the weighted mean ("Model soups", Wortsman et al., 2022, section 2).
+
+    Args:
+        target: the tree to change; its values are not read.
+        sources: N models θ_n.
+        weights: w_n, 0 or more, a scalar or [N].
+        normalise: whether the sum is divided by Σ w_n.
+        population: whether leaves are stacked on an axis P.
+        where: the leaves to change.
+
+    Raises:
+        ValueError: as :func:`transfer.fraction`; not one weight for each source, or all of them 0.
+
+    >>> average({"w": jnp.zeros(1)}, [{"w": jnp.ones(1)}, {"w": 4 * jnp.ones(1)}], weights=[2, 1])
+    {'w': Array([2.], dtype=float32)}
+    """
+    for entry in jax.tree.leaves(weights, is_leaf=lambda x: isinstance(x, list | tuple)):
+        concrete = all(map(is_concrete, jax.tree.leaves(entry)))
+        if normalise and concrete and not isinstance(entry, str) and not np.any(entry):
+            raise ValueError("The weights are all 0; expected one of them greater.")
+
+    def formula(base, models, weights):
+        return _combined(models, weights, normalise)
+
+    return _merge(
+        "average",
+        formula,
+        target,
+        sources,
+        where,
+        population,
+        reads_target=False,
+        weights=_Number(weights, each=True, low=0.0, high=None),
+    )
 
 
 def _weighted(weights: Array, vectors: Array) -> Array:
@@ -339,7 +386,8 @@ def breadcrumbs(
     """Task vectors without their largest and smallest numbers (Davari and Belilovsky, 2024).
 
     "Model Breadcrumbs", section 3.1: leaf by leaf τ̂_n leaves out the ⌊outliers · n⌋ largest
-    magnitudes, keeps the ⌊density · n⌋ next, and drops the rest; θ₀ + λ Σ w_n τ̂_n.
+    magnitudes (fewer where not enough would remain), keeps the ⌊density · n⌋ next, and drops the
+    rest; θ₀ + λ Σ w_n τ̂_n.
 
     Args:
         target: θ₀, the model that the sources were trained from.
@@ -363,8 +411,10 @@ def breadcrumbs(
 
     def formula(base, models, density, outliers, weights, scale):
         vectors = models - base
-        largest = _kept(outliers, vectors)
-        between = _largest(vectors, _kept(density, vectors), skip=largest)
+        kept = _kept(density, vectors)
+        size = math.prod(vectors.shape[1:])
+        largest = jnp.minimum(_kept(outliers, vectors), size - kept)
+        between = _largest(vectors, kept, skip=largest)
         merge = _elected if elect_sign else _combined
         return base + scale * merge(jnp.where(between, vectors, 0), weights, normalise)
 
@@ -533,5 +583,6 @@ def karcher_mean(
         sources,
         where,
         population,
+        reads_target=False,
         weights=_Number(weights, each=True, low=0.0, high=None),
     )

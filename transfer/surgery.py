@@ -27,7 +27,7 @@ one key, so that a vector never scales the rows of a matrix by mistake. Axes are
 end, and mean the same for one tree and for a population.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -42,7 +42,6 @@ from transfer.leaves import (
     cast,
     check_casting,
     check_key,
-    check_range,
     check_shape,
     draw,
     find,
@@ -450,51 +449,5 @@ def _resize(target, source, axis, fill, groups, casting, where, *, larger):
         filled = fill is not None
         base = jnp.full(leaf.shape, fill, leaf.dtype) if filled else _values(path, leaf)
         return cast(path, split(base).at[place].set(part).reshape(leaf.shape), leaf)
-
-    return change(target, where, leaf_operation)
-
-
-def average(
-    target: PyTree,
-    sources: Sequence[PyTree],
-    *,
-    weights: Any = None,
-    where: Where = None,
-) -> PyTree:
-    """The weighted mean of several sources in place of the target's leaves.
-
-    Args:
-        target: the tree to change.
-        sources: N trees.
-        weights: [N], 0 or more, divided by their sum; equal by default. Traced or not.
-        where: the leaves to change.
-
-    Raises:
-        ValueError: no sources, not one weight for each, or weights that are negative or all 0.
-
-    >>> average({"w": jnp.zeros(1)}, [{"w": jnp.ones(1)}, {"w": 4 * jnp.ones(1)}], weights=[2, 1])
-    {'w': Array([2.], dtype=float32)}
-    """
-    flat = [flatten(source) for source in sources]
-    if not flat:
-        raise ValueError("average needs at least one source, got none.")
-    weights = jnp.ones(len(flat)) if weights is None else weights
-    check_range("weights", weights, low=0.0, high=None)
-    weights = jnp.asarray(weights, jnp.float32)
-    if weights.shape != (len(flat),):
-        raise ValueError(f"Got weights of shape {weights.shape} for {len(flat)} sources.")
-    total = weights.sum()
-    if not isinstance(total, jax.core.Tracer) and total <= 0:
-        raise ValueError("The weights are all 0; expected one of them greater.")
-    shares = weights / total
-
-    def leaf_operation(path, leaf):
-        others = [beside(find(source, path), leaf) for source in flat]
-        numeric(path, "average", leaf, *others)
-        for other in others:
-            check_shape(path, leaf, other)
-            check_casting(path, other, leaf, "same_kind")
-        parts = [share * wide(path, other) for share, other in zip(shares, others, strict=True)]
-        return cast(path, sum(parts), leaf)
 
     return change(target, where, leaf_operation)
