@@ -399,7 +399,7 @@ def test_average_is_the_weighted_mean():
     sources = [{"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([3.0, 6.0])}]
     np.testing.assert_allclose(transfer.average(target, sources)["w"], [2, 4])
     np.testing.assert_allclose(transfer.average(target, sources, weights=[3, 1])["w"], [1.5, 3])
-    with pytest.raises(ValueError, match=r"weights of shape \(1,\) for 2 sources"):
+    with pytest.raises(ValueError, match=r"w: weights has shape \(1,\); .* each of 2 sources"):
         transfer.average(target, sources, weights=[1.0])
     with pytest.raises(ValueError, match="at least one source"):
         transfer.average(target, [])

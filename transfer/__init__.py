@@ -27,8 +27,10 @@ from transfer.merging import (
     task_arithmetic,
     ties,
 )
+from transfer.optimizer_state import apply_to_optimizer
 from transfer.plan import Plan, Rule, claims, frozen
 from transfer.plan_files import read_plan, write_plan
+from transfer.plasticity import dormancy, dormant_units, recycle, reset_periodically
 from transfer.population import replicate, stack, unstack
 from transfer.report import Report
 from transfer.select import (
@@ -63,6 +65,7 @@ __all__ = [
     "Report",
     "Rule",
     "apply",
+    "apply_to_optimizer",
     "average",
     "breadcrumbs",
     "claims",
@@ -72,6 +75,8 @@ __all__ = [
     "crop",
     "dare",
     "difference",
+    "dormancy",
+    "dormant_units",
     "escape",
     "flatten",
     "fraction",
@@ -90,8 +95,10 @@ __all__ = [
     "paths",
     "read_mergekit",
     "read_plan",
+    "recycle",
     "reinitialise",
     "replicate",
+    "reset_periodically",
     "save",
     "scale_learning_rates",
     "select",

@@ -61,7 +61,7 @@ def source_leaves(
     flat, names = flatten(source), {}
     for path, rule in claims(plan, target).items():
         if "source" in _signature(rule, operations):
-            names |= dict.fromkeys(_places(rule, path, 0, flat))
+            names |= dict.fromkeys(source_places(rule, path, flat))
     return {name: find(flat, name) for name in names}
 
 
@@ -471,17 +471,27 @@ def _reads(
         yield (
             reading.name,
             tree,
-            {path: _places(rule, path, number, tree, several) for path in mine},
+            {
+                path: source_places(rule, path, tree, number=number if several else None)
+                for path in mine
+            },
         )
         if not several:
             return
 
 
-def _places(
-    rule: Rule, path: str, number: int, tree: Mapping[str, Array], several: bool = False
+def source_places(
+    rule: Rule, path: str, tree: Mapping[str, Array], *, number: int | None = None
 ) -> tuple[str, ...]:
-    """The paths in a source that a leaf of the target is made from."""
-    readings = rule.readings[number : number + 1] if several else rule.readings
+    """The paths in a source that a leaf of the target is made from.
+
+    Args:
+        rule: the rule that claims the leaf.
+        path: the leaf's path.
+        tree: the source's leaves by path.
+        number: which of the rule's entries for its sources is meant; ``None`` for all together.
+    """
+    readings = rule.readings if number is None else (rule.readings[number],)
     found: list[str] = []
     captured = rule.captured(path)
     for reading in readings:

@@ -55,10 +55,11 @@ def read_mergekit(path: str | os.PathLike, *, layers: str = "layers") -> Plan:
     its sources are called by the models' names in the file:
     ``apply(plan, base, {"org/model-a": a, "org/model-b": b})``. ``dare`` asks for a key.
 
-    As in mergekit a gradient is spread over the layers, which here are what stands behind ``layers``
-    in a path; leaves outside of them get its first value if their path holds "embed", else its last.
-    A filter selects the leaves whose path holds it, a dot in it being a ``/``. Unlike mergekit,
-    a filter that selects nothing is an error, and DARE rescales as its paper does, by 1 / density.
+    As in mergekit a gradient is spread over the layers, which here are what stands behind
+    ``layers`` in a path; leaves outside of them get its first value if their path holds "embed",
+    else its last. A filter selects the leaves whose path holds it, a dot in it being a ``/``.
+    Unlike mergekit, a filter that selects nothing is an error, and DARE rescales as its paper does,
+    by 1 / density.
 
     Args:
         path: a ``.yaml``, ``.yml`` or ``.json`` file.
