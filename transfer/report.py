@@ -141,6 +141,8 @@ class Report:
         arguments = ", ".join(
             f"{name}={_show(value)}" for name, value in record["parameters"].items()
         )
+        if record["source"] is not None:
+            arguments = ", ".join(filter(None, [arguments, f"from {record['source']}"]))
         return (
             record["leaf"],
             "x".join(map(str, record["shape"])) or "scalar",
