@@ -25,6 +25,7 @@ COMMANDS = {
     "rollout-brax": "rollout task=brax/hopper,brax/ant,brax/inverted_pendulum P=1,8",
     "replay": "replay",
     "transfer": "transfer",
+    "streaming": "streaming",
     "train": "train",
 }
 

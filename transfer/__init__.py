@@ -30,6 +30,7 @@ from transfer.merging import (
 from transfer.optimizer_state import apply_to_optimizer
 from transfer.plan import Plan, Rule, claims, frozen
 from transfer.plan_files import read_plan, write_plan
+from transfer.plan_views import diff, draw, outline, to_html
 from transfer.plasticity import dormancy, dormant_units, recycle, reset_periodically
 from transfer.population import replicate, stack, unstack
 from transfer.report import Report
@@ -74,9 +75,11 @@ __all__ = [
     "copy",
     "crop",
     "dare",
+    "diff",
     "difference",
     "dormancy",
     "dormant_units",
+    "draw",
     "escape",
     "flatten",
     "fraction",
@@ -90,6 +93,7 @@ __all__ = [
     "match",
     "model_stock",
     "open_file",
+    "outline",
     "pad",
     "partition",
     "paths",
@@ -113,6 +117,7 @@ __all__ = [
     "take",
     "task_arithmetic",
     "ties",
+    "to_html",
     "unflatten",
     "unfreeze_gradually",
     "union",
