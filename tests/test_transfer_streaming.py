@@ -171,8 +171,10 @@ def test_fractions_of_a_plan_may_differ_between_leaves_and_go_through_yaml(tmp_p
     transfer.write_plan(plan, tmp_path / "plan.yaml")
     again = transfer.read_plan(tmp_path / "plan.yaml")
     assert again == plan and hash(again) == hash(plan)
-    new, _ = apply(again, WEIGHTS, KNOWN)
-    assert (new["l0"]["w"][0], new["l1"]["w"][0]) == (0.25, 0.5)
+    for run in (apply, stream):
+        new, report = run(again, WEIGHTS, KNOWN)
+        assert (new["l0"]["w"][0], new["l1"]["w"][0]) == (0.25, 0.5)
+        assert [r["parameters"]["omega"] for r in report.records()] == [0.25, 0.5, 0.5]
 
 
 def test_the_gradient_finds_the_fraction_of_each_layer():

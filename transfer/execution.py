@@ -545,12 +545,13 @@ def _resolved(rule, name, value, mine, before, operation) -> Any:
     """A parameter that differs between leaves as ``{path: number}``; any other as it is."""
     if is_gradient(value):
         return _PerLeaf(_gradient(rule, name, value, mine))
+    value = _plain(value)
     known = OPERATIONS.get(operation.__name__) is operation
     if not known or name == "initializer" or jax.tree_util.all_leaves([value]):
-        return _plain(value)
+        return value
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         return value
-    return _PerLeaf(numbers(name, _plain(value), list(before), mine, low=None, high=None))
+    return _PerLeaf(numbers(name, value, list(before), mine, low=None, high=None))
 
 
 def _plain(value: Any) -> Any:

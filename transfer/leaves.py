@@ -163,10 +163,12 @@ def wide(path: str, leaf: Array) -> Array:
     return jnp.asarray(leaf).astype(jax.dtypes.canonicalize_dtype(wide_dtype(leaf.dtype)))
 
 
-def _kind(dtype: Any) -> int:
+def _kind(path: str, leaf: Array) -> int:
     """bool < integer < floating point < complex."""
-    kinds = (jnp.bool_, jnp.integer, jnp.floating, jnp.complexfloating)
-    return next(number for number, kind in enumerate(kinds) if jnp.issubdtype(dtype, kind))
+    for number, kind in enumerate((jnp.bool_, jnp.integer, jnp.floating, jnp.complexfloating)):
+        if jnp.issubdtype(leaf.dtype, kind):
+            return number
+    raise ValueError(f"{path}: a leaf of dtype {leaf.dtype} holds no numbers.")
 
 
 def check_casting(path: str, source: Array, target: Array, casting: str) -> None:
@@ -184,7 +186,7 @@ def check_casting(path: str, source: Array, target: Array, casting: str) -> None
         raise ValueError(f"{path}: the target is {target.dtype}, the source {source.dtype}.")
     if casting == "unsafe":
         return
-    if casting == "no" or _kind(source.dtype) > _kind(target.dtype):
+    if casting == "no" or _kind(path, source) > _kind(path, target):
         raise ValueError(
             f"{path}: the target is {target.dtype}, the source {source.dtype}, and "
             f"casting={casting!r} does not turn one into the other. Convert one of the trees, or "
