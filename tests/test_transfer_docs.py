@@ -1,6 +1,7 @@
 """Every block of Python in the pages on the transfer library prints what is shown under it."""
 
 import pytest
+
 from test_docs import DOCS, run, sections
 
 PAGES = sorted(page.name for page in DOCS.glob("transfer_*.md"))
