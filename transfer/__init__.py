@@ -17,17 +17,9 @@ from transfer.freeze import (
     unfreeze_gradually,
 )
 from transfer.mergekit import read_mergekit
-from transfer.merging import (
-    average,
-    breadcrumbs,
-    dare,
-    karcher_mean,
-    model_stock,
-    slerp,
-    task_arithmetic,
-    ties,
-)
+from transfer.merging import average, karcher_mean, model_stock, slerp
 from transfer.optimizer_state import apply_to_optimizer
+from transfer.patterns import escape, match
 from transfer.plan import Plan, Rule, claims, frozen
 from transfer.plan_files import read_plan, write_plan
 from transfer.plan_views import diff, draw, outline, to_html
@@ -37,10 +29,8 @@ from transfer.report import Report
 from transfer.select import (
     complement,
     difference,
-    escape,
     flatten,
     intersection,
-    match,
     paths,
     select,
     selected,
@@ -59,6 +49,7 @@ from transfer.surgery import (
     splice,
     take,
 )
+from transfer.task_vectors import breadcrumbs, dare, task_arithmetic, ties
 
 __all__ = [
     "OPERATIONS",

@@ -21,7 +21,8 @@ import numpy as np
 
 from transfer import npz_files, safetensors_files
 from transfer.file_tools import ArrayFile, check_size, damage
-from transfer.select import PyTree, Where, flatten, match_paths, selected
+from transfer.patterns import match_paths
+from transfer.select import PyTree, Where, flatten, selected
 
 
 def save(path: str | os.PathLike, tree: PyTree, where: Where = None) -> None:

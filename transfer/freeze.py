@@ -16,17 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from transfer.select import (
-    PyTree,
-    Where,
-    flatten,
-    join,
-    match_paths,
-    paths,
-    selected,
-    split,
-    unflatten,
-)
+from transfer.patterns import match_paths
+from transfer.select import PyTree, Where, flatten, join, paths, selected, split, unflatten
 
 
 def _no_update() -> optax.GradientTransformation:

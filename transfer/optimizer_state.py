@@ -11,12 +11,14 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from transfer.execution import OPERATIONS, source_places
+from transfer.execution import OPERATIONS
 from transfer.layout import arrange
-from transfer.leaves import check_range, check_shape, find
+from transfer.leaves import check_shape, find
 from transfer.plan import Operations, Plan, Rule, claims
+from transfer.reading import source_places
 from transfer.select import PyTree, flatten, unflatten
 from transfer.surgery import copy, crop, pad, splice, take
+from transfer.values import check_range
 
 MOVES: Mapping[str, Callable[..., PyTree]] = {
     move.__name__: move for move in (copy, take, splice, pad, crop)

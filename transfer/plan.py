@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from transfer import layout as layouts
-from transfer.select import Mask, PyTree, captures, mask_of, match_paths, paths
+from transfer.patterns import captures, match_paths
+from transfer.select import Mask, PyTree, mask_of, paths
 
 
 class Parameters(Mapping[str, Any]):

@@ -14,9 +14,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from transfer.leaves import axis_number, cast, check_range, check_shape, find
-from transfer.select import PyTree, Where, flatten, mask_of, match_paths, paths
+from transfer.leaves import axis_number, cast, check_shape, find
+from transfer.patterns import match_paths
+from transfer.select import PyTree, Where, flatten, mask_of, paths
 from transfer.surgery import change
+from transfer.values import check_range
 
 Array = Any
 

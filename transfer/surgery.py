@@ -46,15 +46,14 @@ from transfer.leaves import (
     draw,
     find,
     find_initializer,
-    numbers,
     numeric,
-    per_member,
     positions,
     same_but,
     wide,
     wide_dtype,
 )
 from transfer.select import PyTree, Where, flatten, paths, selected, unflatten
+from transfer.values import numbers, per_member
 
 
 def change(target: PyTree, where: Where, leaf_operation: Callable[[str, Array], Array]) -> PyTree:
