@@ -81,6 +81,29 @@ def test_numbers_in_range_are_taken(operation):
     assert np.isfinite(run(operation, SQUARE)["w"]).all()
 
 
+@hypothesis.settings(max_examples=60, deadline=None)
+@hypothesis.given(st.floats() | st.integers(-3, 3) | st.sampled_from((0.0, 1.0, 1e-30)))
+def test_any_number_is_in_range_or_refused(omega):
+    if 0 <= omega <= 1:
+        assert np.isfinite(transfer.fraction(SQUARE, SQUARE, omega=omega)["w"]).all()
+    else:
+        with pytest.raises(ValueError, match=r"omega is .*; expected numbers in \[0, 1\]"):
+            transfer.fraction(SQUARE, SQUARE, omega=omega)
+
+
+@pytest.mark.parametrize(
+    "omega",
+    [None, "0.5", object(), 1j, [0.5, "a"], {}, {"w": None}, {"w": "a"}, np.array("a"), {1}],
+)
+def test_what_is_no_number_is_a_value_error(omega):
+    for call in (
+        lambda: transfer.fraction(SQUARE, SQUARE, omega=omega),
+        lambda: apply(Plan((Rule("**", "fraction"),)), SQUARE, SQUARE, omega=omega),
+    ):
+        with pytest.raises(ValueError, match="omega"):
+            call()
+
+
 def test_a_number_that_yaml_took_for_text_is_named():
     with pytest.raises(ValueError, match="omega is '1e-3'; .*write 1.0e-3"):
         transfer.fraction(SQUARE, SQUARE, omega="1e-3")

@@ -46,11 +46,18 @@ class View(Leaves):
     def __init__(self, rule, tree, places, target, members):
         self._rule, self._tree, self._places = rule, tree, places
         self._target, self._members = target, members
+        # What is made of arrays in memory is made once; of a file it would fill the memory.
+        self._made: dict[str, Array] | None = None if isinstance(tree, Leaves) else {}
 
     def __getitem__(self, path: str) -> Array:
         if path not in self._places:
             return find(self._tree, path)
-        return self._arranged(path, [find(self._tree, place) for place in self._places[path]])
+        if self._made is not None and path in self._made:
+            return self._made[path]
+        made = self._arranged(path, [find(self._tree, place) for place in self._places[path]])
+        if self._made is not None:
+            self._made[path] = made
+        return made
 
     def _arranged(self, path: str, arrays: Sequence[Array]) -> Array:
         rule = self._rule
