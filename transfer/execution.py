@@ -209,7 +209,18 @@ def _values(tree: Mapping[str, Array]) -> Sequence[Array]:
     return () if isinstance(tree, Leaves) else tuple(tree.values())
 
 
-def _prepare(plan, target, source, key, population, strict, *, operations, given) -> _Work:
+def _prepare(
+    plan: Plan,
+    target: PyTree,
+    source: PyTree,
+    key: jax.Array | None,
+    population: bool,
+    strict: bool,
+    *,
+    operations: Operations,
+    given: Mapping[str, Any],
+) -> _Work:
+    """A plan with all that its rules read and need; every error that needs no operation."""
     claimed = claims(plan, target)
     before = flatten(target)
     members = populations.size(target) if population else None

@@ -132,12 +132,12 @@ class Rule:
 
             A tuple names one source each for operations on several (``average``); for others it
             names several leaves, or a path with ``*`` does, that the layout's first step joins.
-        layout: steps from the arrays that are read to the one the operation takes, see
-            :mod:`transfer.layout`.
         optional: whether the patterns may match nothing (a head that not every agent has).
         frozen: whether the leaves are meant to stay as they are in training. ``apply`` only says
             so in its report; :func:`frozen` gives the mask that ``freeze`` acts on.
         note: a word to the reader of the plan.
+        layout: steps from the arrays that are read to the one the operation takes, see
+            :mod:`transfer.layout`.
 
     Lists and arrays among these become tuples, so that a rule is a value that never changes.
 
@@ -150,10 +150,10 @@ class Rule:
     operation: str
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     source: str | tuple[str, ...] | None = None
-    layout: tuple[Any, ...] = ()
     optional: bool = False
     frozen: bool = False
     note: str = ""
+    layout: tuple[Any, ...] = ()
 
     def __post_init__(self):
         patterns = (self.patterns,) if isinstance(self.patterns, str) else self.patterns

@@ -64,7 +64,7 @@ def from_dict(data: Mapping[str, Any]) -> Plan:
 
     >>> from_dict({"rules": [{"patterns": ["head/*"], "operation": "keep"}], "default": "copy"})
     Plan(rules=(Rule(patterns=('head/*',), operation='keep', parameters={}, source=None, \
-layout=(), optional=False, frozen=False, note=''),), default='copy', name='')
+optional=False, frozen=False, note='', layout=()),), default='copy', name='')
     """
     _check_entries(data, "a plan", required=("rules",), known=("name", "rules", "default"))
     if not isinstance(data["rules"], Sequence) or isinstance(data["rules"], str):
