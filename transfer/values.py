@@ -3,7 +3,7 @@
 Axis letters: P population member.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import jax
@@ -18,7 +18,7 @@ def numbers(
     name: str,
     value: Any,
     paths: Sequence[str],
-    chosen: Sequence[str],
+    chosen: Collection[str],
     *,
     low: float | None = 0.0,
     high: float | None = 1.0,
@@ -49,7 +49,8 @@ def numbers(
         if not found:
             raise ValueError(f"{name} has an entry {key!r} for no leaf{suggest(key, paths)}.")
     result = {}
-    for path in chosen:
+    # In tree order, so that an error names the same leaf every time.
+    for path in (path for path in paths if path in chosen):
         keys = [key for key, found in names.items() if path in found]
         if len(keys) != 1:
             listed = " and ".join(map(repr, keys)) or "none"
