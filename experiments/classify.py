@@ -216,7 +216,10 @@ def judge(
         accuracies=tuple(accuracies),
         distances={task: np.asarray(result.distances) for task, result in results.items()},
         votes={
-            task: Counter(known[vote] for vote in np.asarray(result.votes).tolist())
+            # A latent that is not finite has no neighbours that could vote.
+            task: Counter(
+                known[vote] for vote in np.asarray(result.votes).tolist() if vote != ltc.NOVEL
+            )
             for task, result in results.items()
         },
     )
@@ -251,6 +254,8 @@ def distance_table(outcome: Outcome) -> str:
     for task in outcome.tasks:
         distances = outcome.distances[task]
         votes = ", ".join(f"{called[name]} {n}" for name, n in outcome.votes[task].most_common())
+        if lost := round(float(outcome.accuracies[-1][task].not_finite) * len(distances)):
+            votes = ", ".join(filter(None, [votes, f"not finite {lost}"]))
         name = called[task] + ("" if task in outcome.known else ", novel")
         rows.append(
             [name, f"{np.median(distances):.4g}", f"{distances.min():.4g}"]

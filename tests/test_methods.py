@@ -464,3 +464,20 @@ def test_a_spec_says_all_of_a_method_after_json(folder):
     assert type(spec).from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
     assert make_agent(spec) == make_agent(dataclasses.replace(spec, seeds=(9,)))
     assert "meta-model of reward, value, fresh dynamics" in str(plan(spec))
+
+
+def test_latent_states_that_are_not_finite_are_novel_and_counted():
+    from experiments.classify import distance_table, judge, to_dict
+    from experiments.latents import Latents
+
+    random = np.random.default_rng(0)
+    episodes = np.arange(20) // 4
+    half = lambda offset: Latents(random.normal(offset, 0.1, (20, 3)), episodes)  # noqa: E731
+    tasks = ("bullet/ant", "bullet/hopper")
+    drawn = {task: (half(9 * i), half(9 * i)) for i, task in enumerate(tasks)}
+    drawn["bullet/ant"][1].features[:5] = np.nan
+    outcome = judge(tasks, tasks, drawn, thresholds=(3.0,))
+    assert outcome.accuracies[0]["bullet/ant"].not_novel == 0.75
+    assert outcome.votes["bullet/ant"] == {"bullet/ant": 15}
+    assert to_dict(outcome)["accuracies"][0]["not_finite"] == 0.25
+    assert "not finite 5" in distance_table(outcome)

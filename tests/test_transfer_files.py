@@ -66,13 +66,19 @@ def test_patterns_choose_what_is_written_and_what_is_read(tmp_path, name):
         transfer.load(tmp_path / name, "z/*")
 
 
-def test_float8_goes_into_npz_and_orbax_and_safetensors_says_so(tmp_path):
-    tree = {"w": jnp.ones(3, jnp.float8_e4m3fn)}
-    for name in ("x.npz", "x"):
-        transfer.save(tmp_path / name, tree)
-        assert transfer.load(tmp_path / name)["w"].dtype == jnp.float8_e4m3fn
-    with pytest.raises(ValueError, match="w is float8_e4m3fn, which .safetensors cannot"):
-        transfer.save(tmp_path / "x.safetensors", tree)
+@pytest.mark.parametrize("name", NAMES)
+def test_files_hold_8_bit_floating_point_numbers(tmp_path, name):
+    tree = {"w": jnp.ones(3, jnp.float8_e4m3fn), "v": jnp.ones(3, jnp.float8_e5m2)}
+    transfer.save(tmp_path / name, tree)
+    assert bits(transfer.load(tmp_path / name)) == bits(tree)
+    assert transfer.load(tmp_path / name)["w"].dtype == jnp.float8_e4m3fn
+
+
+def test_a_dtype_that_safetensors_has_not_is_named(tmp_path):
+    with pytest.raises(ValueError, match="w is int4, which .safetensors cannot"):
+        transfer.save(tmp_path / "x.safetensors", {"w": jnp.ones(3, jnp.int4)})
+    transfer.save(tmp_path / "x.npz", {"w": jnp.ones(3, jnp.int4)})
+    assert transfer.load(tmp_path / "x.npz")["w"].dtype == jnp.int4
 
 
 def test_other_libraries_read_what_is_written(tmp_path):

@@ -113,7 +113,7 @@ def test_a_plan_equals_its_operations_one_by_one_on_trees_of_every_library(name)
         (PLAN, {}, "'head/. -> fraction' leaves 'omega' open"),
         (PLAN, {"omega": 1.0, "omga": 2.0}, "No rule leaves the parameter omga open"),
         (Plan((Rule("**", "copi"),)), {}, "no known operation; expected one of keep, copy"),
-        (Plan((Rule("**", "copy", {"omega": 1}),)), {}, "sets 'omega'; .* of copy are none"),
+        (Plan((Rule("**", "copy", {"omega": 1}),)), {}, "sets 'omega'; .* of copy are casting"),
         (Plan((Rule("**", "fraction", {"where": "a"}),)), {"omega": 1.0}, "sets 'where'"),
         (
             Plan((Rule("**", "reinitialise", {"initializer": "zeros"}),)),
@@ -309,6 +309,7 @@ def test_the_table_is_aligned_and_counts_operations():
         "new     3      keep()                1.732  1.732       -       -",
         "-----------------------------------------------------------------",
         "3 leaves: 1 copy, 1 fraction, 1 keep",
+        "not read of the source: new",
     ]
 
 

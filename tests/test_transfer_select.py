@@ -11,7 +11,8 @@ import pytest
 from hypothesis import strategies as st
 
 import transfer
-from transfer.select import match, match_paths, selected
+from transfer.patterns import match, match_paths
+from transfer.select import selected
 from transfer_trees import LIBRARIES, library_tree, trees
 
 AGENT = {

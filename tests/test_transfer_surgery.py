@@ -154,7 +154,10 @@ def test_a_stacked_population_with_an_omega_each_equals_its_members_one_by_one(t
     sources = [like(target, seed + 10 + i) for i in range(3)]
     omegas = [0.0, 0.5, 1.0]
     stacked = transfer.fraction(
-        transfer.stack(targets), transfer.stack(sources), omega=jnp.array(omegas)
+        transfer.stack(targets),
+        transfer.stack(sources),
+        omega=jnp.array(omegas),
+        population=True,
     )
     for member, t, s, omega in zip(
         transfer.unstack(stacked), targets, sources, omegas, strict=True
@@ -227,7 +230,12 @@ def test_nothing_broadcasts_even_where_numpy_would():
     with pytest.raises(ValueError, match="population"):
         transfer.copy({"w": jnp.ones((3, 2))}, {"w": jnp.ones(2)})
     with pytest.raises(ValueError, match=r"omega has shape \(2,\).*\(3,\)"):
-        transfer.fraction({"w": jnp.ones((3, 2))}, {"w": jnp.ones((3, 2))}, omega=jnp.ones(2))
+        transfer.fraction(
+            {"w": jnp.ones((3, 2))},
+            {"w": jnp.ones((3, 2))},
+            omega=jnp.ones(2),
+            population=True,
+        )
 
 
 def test_a_leaf_the_source_lacks_is_an_error_only_where_it_is_needed():
@@ -247,11 +255,15 @@ def test_integers_and_keys_can_be_copied_but_not_added():
             transfer.fraction(tree, tree, omega=0.5, where=path)
 
 
-def test_float64_of_numpy_is_kept_or_refused_but_never_narrowed():
+def test_a_float64_target_is_refused_where_jax_would_narrow_it():
     wide = {"w": np.ones(2)}
-    assert transfer.fraction(wide, wide, omega=0.5)["w"].dtype == np.float64
+    for source in (wide, {"w": jnp.ones(2)}):
+        with pytest.raises(ValueError, match="w: the target is float64"):
+            transfer.copy(wide, source)
     with pytest.raises(ValueError, match="w: the target is float64"):
-        transfer.copy(wide, {"w": jnp.ones(2)})
+        transfer.fraction(wide, wide, omega=0.5)
+    with jax.enable_x64(True):
+        assert transfer.fraction(wide, wide, omega=0.5)["w"].dtype == np.float64
 
 
 def test_reinitialise_draws_from_the_initializer_with_a_key_for_each_leaf():
@@ -279,16 +291,20 @@ def test_members_of_a_population_are_reinitialised_each_with_its_own_key():
     keys = jax.random.split(KEY, 3)
     tree = {"w": jnp.ones((50, 40))}
     population = transfer.replicate(tree, size=3)
-    drawn = transfer.reinitialise(population, initializer="glorot_uniform", key=keys)
+    drawn = transfer.reinitialise(
+        population, initializer="glorot_uniform", key=keys, population=True
+    )
     for member, key in zip(transfer.unstack(drawn), keys, strict=True):
         assert bits(member) == bits(
             transfer.reinitialise(tree, initializer="glorot_uniform", key=key)
         )
     old_keys = jax.random.key_data(keys)
-    again = transfer.reinitialise(population, initializer="glorot_uniform", key=old_keys)
+    again = transfer.reinitialise(
+        population, initializer="glorot_uniform", key=old_keys, population=True
+    )
     assert bits(again) == bits(drawn)
     with pytest.raises(ValueError, match="one for each member"):
-        transfer.reinitialise(population, initializer="zeros", key=keys[:2])
+        transfer.reinitialise(population, initializer="zeros", key=keys[:2], population=True)
 
 
 @many
@@ -383,7 +399,7 @@ def test_average_is_the_weighted_mean():
     sources = [{"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([3.0, 6.0])}]
     np.testing.assert_allclose(transfer.average(target, sources)["w"], [2, 4])
     np.testing.assert_allclose(transfer.average(target, sources, weights=[3, 1])["w"], [1.5, 3])
-    with pytest.raises(ValueError, match=r"weights of shape \(1,\) for 2 sources"):
+    with pytest.raises(ValueError, match=r"w: weights has shape \(1,\); .* each of 2 sources"):
         transfer.average(target, sources, weights=[1.0])
     with pytest.raises(ValueError, match="at least one source"):
         transfer.average(target, [])

@@ -1,18 +1,17 @@
 """Parameters in files: ``.npz``, ``.safetensors`` and Orbax checkpoints, under '/'-joined names.
 
 :func:`load` gives a flat ``{path: array}``, which every operation and plan takes as a source:
-``transfer.copy(target, load("source.npz", "encoder/**"), where="encoder/**")``. No structure is
-stored but the names, so any tree with the same paths can take the arrays.
+``transfer.copy(target, load("source.npz", "encoder/**"), where="encoder/**")``. :func:`open_file`
+gives the same without reading it: each array is read when it is asked for. No structure is stored
+but the names, so any tree with the same paths can take the arrays.
 
 Nothing that is loaded can execute code: pickles are refused, and no class is looked up by name.
+What a file says of itself (shapes, sizes, offsets) is compared with its size before any memory is
+asked for, and whatever is wrong with it is a ``ValueError`` that names the file.
 """
 
-import json
 import os
-import tempfile
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,61 +19,104 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from transfer.select import PyTree, Where, flatten, match_paths, selected
-
-# Kept beside the arrays in an .npz: NumPy's own format forgets the dtypes of ml_dtypes (bfloat16).
-_DTYPES = "__dtypes__"
+from transfer import npz_files, safetensors_files
+from transfer.file_tools import ArrayFile, check_size, damage
+from transfer.patterns import match_paths
+from transfer.select import PyTree, Where, flatten, selected
 
 
 def save(path: str | os.PathLike, tree: PyTree, where: Where = None) -> None:
     """Write the arrays of a tree, or those selected, to a file.
 
     Args:
-        path: ends in ``.npz`` or ``.safetensors``, which are replaced if they exist; anything else
-            is a folder for a new Orbax checkpoint.
+        path: ends in ``.npz`` or ``.safetensors``, which are replaced if they exist; without a
+            suffix it is a folder for a new Orbax checkpoint (which needs the package
+            orbax-checkpoint). A ``.safetensors`` file holds a SHA-256 of every array beside the
+            names, which :func:`load` compares.
         tree: any pytree.
         where: the leaves to write; all by default.
 
     Raises:
-        ValueError: leaves that the format cannot hold, or no leaves.
+        ValueError: another suffix, leaves that the format cannot hold, or no leaves.
         FileExistsError: an Orbax checkpoint, or anything else, is there already.
     """
     path = Path(path)
+    write = _WRITERS.get(path.suffix.lower())
+    if write is None:
+        if path.suffix:
+            raise ValueError(_unknown_suffix(path))
+        write = _write_orbax
     chosen = selected(tree, where)
     arrays = {name: _to_numpy(name, leaf) for name, leaf in flatten(tree).items() if name in chosen}
     if not arrays:
         raise ValueError(f"There is no array to write to {path}.")
-    _, write = _FORMATS.get(path.suffix, _ORBAX)
     write(path, arrays)
 
 
-def load(path: str | os.PathLike, *patterns: str) -> dict[str, np.ndarray]:
+def load(
+    path: str | os.PathLike, *patterns: Any, max_bytes: int | None = None
+) -> dict[str, np.ndarray]:
     """Read arrays by name; what is not selected is not read.
 
     Args:
-        path: as in :func:`save`; the format is told by the suffix.
+        path: as in :func:`save`; the format is told by the suffix, and a folder is an Orbax
+            checkpoint.
         *patterns: which names to read (see :func:`transfer.select`); all by default.
+        max_bytes: the most memory that the arrays read may take. By default 20 times what the file
+            takes on disk, and 256 MiB at least, which only compressed files can exceed.
 
     Returns:
         ``{path: array}``, with the dtypes that were written.
 
     Raises:
         FileNotFoundError: nothing is there.
-        ValueError: the file is damaged, holds Python objects, or a pattern matches no name in it.
+        ValueError: the suffix is unknown; the file is damaged, holds Python objects, or takes more
+            than ``max_bytes``; or a pattern matches no name in it.
+    """
+    with open_file(path, max_bytes=max_bytes) as file:
+        names = list(file)
+        chosen = match_paths(names, *patterns) if patterns else set(names)
+        return file.read([name for name in names if name in chosen])
+
+
+def open_file(path: str | os.PathLike, *, max_bytes: int | None = None) -> ArrayFile:
+    """The arrays of a file as a mapping that reads each when it is asked for.
+
+    It is a source for every operation and plan; :func:`transfer.apply` and
+    :func:`transfer.stream` take it leaf by leaf. Close it, or use it in ``with``.
+
+    Args:
+        path: as for :func:`load`.
+        max_bytes: as for :func:`load`, of each array and of each call that reads several.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ValueError: the suffix is unknown, or the file is damaged.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"There is no file or folder {path}.")
-    read, _ = _FORMATS.get(path.suffix, _ORBAX)
-    return read(path, lambda names: match_paths(names, *patterns) if patterns else set(names))
+    if path.is_dir():
+        return _OrbaxFolder(path, max_bytes)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ValueError(_unknown_suffix(path))
+    return reader(path, max_bytes)
 
 
-Choose = Callable[[list[str]], Any]
+def _unknown_suffix(path: Path) -> str:
+    suffix = f"The suffix {path.suffix!r} of {path}" if path.suffix else f"The file {path}"
+    return (
+        f"{suffix} names no known format: {' and '.join(_READERS)} are files, and a path without a "
+        "suffix is a folder for an Orbax checkpoint."
+    )
 
 
 def _to_numpy(name: str, leaf: Any) -> np.ndarray:
     if not name:
         raise ValueError("A bare array has no name to be stored under; put it in a dictionary.")
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        raise ValueError(f"{name} is a shape without values, which no file holds.")
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         raise ValueError(
             f"{name} is a typed PRNG key, which no file holds; leave it out, or store "
@@ -83,104 +125,22 @@ def _to_numpy(name: str, leaf: Any) -> np.ndarray:
     return np.asarray(leaf)
 
 
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary file that takes the place of ``path`` when, and only when, it is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-# --- .npz ------------------------------------------------------------------------------------
-
-
-def _write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    if _DTYPES in arrays:
-        raise ValueError(f"The name {_DTYPES!r} is taken; rename that leaf.")
-    dtypes = {name: array.dtype.name for name, array in arrays.items() if array.dtype.kind == "V"}
-    entries = {
-        name: array.view(f"u{array.itemsize}") if name in dtypes else array
-        for name, array in arrays.items()
-    }
-    if dtypes:
-        entries[_DTYPES] = np.array(json.dumps(dtypes))
-    # np.savez would take a leaf named "file" for its own argument.
-    with _replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, array in entries.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, array, allow_pickle=False)
-
-
-def _read_npz(path: Path, choose: Choose) -> dict[str, np.ndarray]:
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is damaged, or no .npz file.")
-    with np.load(path, allow_pickle=False) as archive:
-        dtypes = json.loads(str(archive[_DTYPES])) if _DTYPES in archive else {}
-        names = [name for name in archive if name != _DTYPES]
-        chosen = choose(names)
-        arrays = {name: _read_entry(path, archive, name) for name in names if name in chosen}
-    return {
-        name: array.view(jnp.dtype(dtypes[name])) if name in dtypes else array
-        for name, array in arrays.items()
-    }
-
-
-def _read_entry(path: Path, archive: Any, name: str) -> np.ndarray:
-    try:
-        return archive[name]
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{name} in {path} is damaged or holds Python objects, which are never loaded."
-        ) from error
-
-
-# --- .safetensors ----------------------------------------------------------------------------
-
-
-def _write_safetensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    from safetensors.numpy import save_file
-
-    for name, array in arrays.items():
-        if array.dtype.kind == "V" and array.dtype != jnp.bfloat16:
-            raise ValueError(
-                f"{name} is {array.dtype}, which .safetensors cannot give back to NumPy; "
-                "use .npz or an Orbax checkpoint."
-            )
-    with _replacing(path) as temporary:
-        save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
-
-
-def _read_safetensors(path: Path, choose: Choose) -> dict[str, np.ndarray]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="numpy") as file:
-            names = list(file.keys())
-            chosen = choose(names)
-            return {name: file.get_tensor(name) for name in names if name in chosen}
-    except (SafetensorError, AttributeError) as error:  # AttributeError: a dtype NumPy lacks
-        raise ValueError(f"{path} cannot be read: {error}") from error
-
-
 # --- Orbax -----------------------------------------------------------------------------------
 
 
-def _write_orbax(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    import orbax.checkpoint as ocp
+def _orbax() -> Any:
+    try:
+        import orbax.checkpoint
+    except ImportError:
+        raise ImportError(
+            "Orbax checkpoints need the package orbax-checkpoint: "
+            "pip install 'dreamer-transfer[files]'. .npz and .safetensors need nothing."
+        ) from None
+    return orbax.checkpoint
 
+
+def _write_orbax(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    ocp = _orbax()
     if path.exists():
         raise FileExistsError(f"{path} exists; choose another folder for the checkpoint.")
     if empty := [name for name, array in arrays.items() if not array.size]:
@@ -205,39 +165,76 @@ def _nest(arrays: Mapping[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def _read_orbax(path: Path, choose: Choose) -> dict[str, np.ndarray]:
-    import orbax.checkpoint as ocp
+class _OrbaxFolder(ArrayFile):
+    """An Orbax checkpoint of a pytree."""
 
-    if not (path / "_METADATA").exists():
-        inside = sorted(str(found.parent) for found in path.glob("*/_METADATA"))
-        hint = f"; there is one in {', '.join(inside)}" if inside else ""
-        raise ValueError(
-            f"{path} is no Orbax checkpoint{hint}. Other formats are told by the suffix, "
-            f"{' or '.join(_FORMATS)}."
-        )
-    with ocp.PyTreeCheckpointer() as checkpointer:
-        stored = checkpointer.metadata(path.absolute()).item_metadata.tree
-        names = list(flatten(stored))
-        chosen = choose(names)
-        places, structure = jax.tree.flatten(stored)
+    def __init__(self, path: Path, max_bytes: int | None):
+        if not (path / "_METADATA").exists():
+            raise ValueError(_no_checkpoint(path))
+        ocp = _orbax()
+        super().__init__(path, max_bytes)
+        with damage(path), ocp.PyTreeCheckpointer() as checkpointer:
+            self._stored = checkpointer.metadata(path.absolute()).item_metadata.tree
+            self._names = list(flatten(self._stored))
+            leaves = flatten(self._stored).values()
+            self._shapes = {
+                name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+                for name, leaf in zip(self._names, leaves, strict=True)
+            }
+
+    @property
+    def disk_bytes(self) -> int:
+        return sum(file.stat().st_size for file in self._path.rglob("*") if file.is_file())
+
+    @property
+    def shapes(self) -> Mapping[str, jax.ShapeDtypeStruct]:
+        return self._shapes
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def read(self, names) -> dict[str, np.ndarray]:
+        ocp = _orbax()
+        names = set(names)
+        check_size(self, names)
+        places, structure = jax.tree.flatten(self._stored)
         wanted = [
-            place if name in chosen else ocp.PLACEHOLDER
-            for name, place in zip(names, places, strict=True)
+            place if name in names else ocp.PLACEHOLDER
+            for name, place in zip(self._names, places, strict=True)
         ]
         # As NumPy arrays, so that a checkpoint from other devices needs no sharding here.
         kind = [ocp.RestoreArgs(restore_type=np.ndarray)] * len(places)
-        restored = checkpointer.restore(
-            path.absolute(),
-            args=ocp.args.PyTreeRestore(
-                item=structure.unflatten(wanted), restore_args=structure.unflatten(kind)
-            ),
-        )
-    leaves = jax.tree.leaves(restored)
-    return {name: leaf for name, leaf in zip(names, leaves, strict=True) if name in chosen}
+        with damage(self._path), ocp.PyTreeCheckpointer() as checkpointer:
+            restored = checkpointer.restore(
+                self._path.absolute(),
+                args=ocp.args.PyTreeRestore(
+                    item=structure.unflatten(wanted), restore_args=structure.unflatten(kind)
+                ),
+            )
+            leaves = jax.tree.leaves(restored)
+            return {
+                name: leaf for name, leaf in zip(self._names, leaves, strict=True) if name in names
+            }
 
 
-_FORMATS = {
-    ".npz": (_read_npz, _write_npz),
-    ".safetensors": (_read_safetensors, _write_safetensors),
+def _no_checkpoint(path: Path) -> str:
+    inside = [found.parent for depth in ("*", "*/*") for found in path.glob(f"{depth}/_METADATA")]
+    steps = [found for found in inside if found.relative_to(path).parts[0].isdigit()]
+    hint = f" Other formats are told by the suffix, {' or '.join(_READERS)}."
+    if steps:
+        steps.sort(key=lambda found: int(found.relative_to(path).parts[0]))
+        numbers = ", ".join(dict.fromkeys(found.relative_to(path).parts[0] for found in steps))
+        hint = f": it holds the checkpoints of steps {numbers}. The latest is {steps[-1]}."
+    elif inside:
+        listed = ", ".join(sorted(map(str, inside)))
+        hint = f"; there is one in {listed}."
+    elif path.suffix:
+        hint = "."
+    return f"{path} is no Orbax checkpoint" + (hint if hint[0] in ":;." else "." + hint)
+
+
+_READERS = {
+    ".npz": npz_files.NpzFile,
+    ".safetensors": safetensors_files.SafetensorsFile,
 }
-_ORBAX = (_read_orbax, _write_orbax)
+_WRITERS = {".npz": npz_files.write, ".safetensors": safetensors_files.write}

@@ -9,22 +9,15 @@ Freezing has three prices, each avoidable: the update (:func:`freeze`), the opti
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
-from transfer.select import (
-    PyTree,
-    Where,
-    flatten,
-    is_array,
-    match_paths,
-    paths,
-    selected,
-    unflatten,
-)
+from transfer.patterns import match_paths
+from transfer.select import PyTree, Where, flatten, join, paths, selected, split, unflatten
 
 
 def _no_update() -> optax.GradientTransformation:
@@ -78,8 +71,33 @@ class _DelayedState(NamedTuple):
     inner: optax.OptState
 
 
+def _is_schedule(node: Any) -> bool:
+    """Whether a part of an optimiser's state counts the steps of a schedule."""
+    return isinstance(node, _SCHEDULES)
+
+
+_SCHEDULES = (optax.ScaleByScheduleState, optax.InjectHyperparamsState) + (
+    (optax.InjectStatefulHyperparamsState,)
+    if hasattr(optax, "InjectStatefulHyperparamsState")
+    else ()
+)
+
+
+def _waiting(before: PyTree, after: PyTree) -> PyTree:
+    """The state of an optimiser that waits: as it was, but for the steps of its schedules."""
+
+    def choose(old, new):
+        if not _is_schedule(old):
+            return old
+        if not hasattr(old, "inner_state"):
+            return new
+        return new._replace(inner_state=_waiting(old.inner_state, new.inner_state))
+
+    return jax.tree.map(choose, before, after, is_leaf=_is_schedule)
+
+
 def _delayed(
-    optimizer: optax.GradientTransformation, start: Any
+    optimizer: optax.GradientTransformation, start: Any, restart: bool
 ) -> optax.GradientTransformationExtraArgs:
     """An optimiser that begins, from its initial state, at step ``start``."""
     optimizer = optax.with_extra_args_support(optimizer)
@@ -91,29 +109,40 @@ def _delayed(
         new, inner = optimizer.update(updates, state.inner, params, **extra)
         active = state.step >= start
         new = jax.tree.map(lambda update: jnp.where(active, update, -jnp.zeros_like(update)), new)
-        inner = jax.tree.map(lambda a, b: jnp.where(active, a, b), inner, state.inner)
+        waiting = state.inner if restart else _waiting(state.inner, inner)
+        inner = jax.tree.map(lambda a, b: jnp.where(active, a, b), inner, waiting)
         return new, _DelayedState(optax.safe_increment(state.step), inner)
 
     return optax.GradientTransformationExtraArgs(init, update)
 
 
 def unfreeze_gradually(
-    optimizer: optax.GradientTransformation, starts: Mapping[str, int]
+    optimizer: optax.GradientTransformation,
+    starts: Mapping[str | tuple[str, ...], int],
+    *,
+    schedules: Literal["continue", "restart"] = "continue",
 ) -> optax.GradientTransformationExtraArgs:
     """An optimiser that begins to train some leaves later than others.
 
     Until its first step a leaf is exactly as it was, and the optimiser's memory of it is fresh (so
-    that Adam's bias correction is right when it begins). Leaves that begin together are one group
-    with an optimiser of their own: what couples all leaves, such as a global norm, goes outside:
+    that Adam's bias correction is right when it begins). All leaves that begin at one step are one
+    group with an optimiser of their own: what couples leaves, such as a global norm, sees the
+    group. To couple all leaves put it outside:
     ``optax.chain(optax.clip_by_global_norm(1.0), unfreeze_gradually(optax.adam(1e-3), ...))``.
 
     Args:
         optimizer: what trains each group.
-        starts: pattern -> the first step (0 is the first of all) at which its leaves train.
-            Leaves that no pattern names train from the first step on.
+        starts: pattern, or a tuple of patterns as :func:`transfer.select` takes them -> the first
+            step (0 is the first of all) at which its leaves train. Leaves that no pattern names
+            train from the first step on.
+        schedules: whether a schedule inside the optimiser (a learning rate that decays) counts
+            all steps of the training, so that late leaves begin with the rate of the moment, or
+            restarts for each group with its first step. Known are those of Optax
+            (``optax.scale_by_schedule``, a rate given as a schedule, ``optax.inject_hyperparams``).
 
     Raises:
-        ValueError: at ``init``, where a pattern matches nothing or two match one leaf.
+        ValueError: a start that is no step; at ``init``, where a pattern matches nothing or two
+            match one leaf.
 
     >>> params = {"body": jnp.ones(1), "head": jnp.ones(1)}
     >>> optimizer = unfreeze_gradually(optax.sgd(0.5), {"body": 1})
@@ -125,26 +154,32 @@ def unfreeze_gradually(
     [1.] [0.5]
     [0.5] [0.25]
     """
-    groups = {0: optimizer} | {
-        number: _delayed(optimizer, start) for number, start in enumerate(starts.values(), start=1)
+    if schedules not in ("continue", "restart"):
+        raise ValueError(f"schedules is 'continue' or 'restart'; got {schedules!r}.")
+    for patterns, start in starts.items():
+        if isinstance(start, bool) or not isinstance(start, int | np.integer) or start < 0:
+            raise ValueError(f"{patterns!r} starts at {start!r}; expected a step, 0 or more.")
+    groups = {
+        int(start): _delayed(optimizer, int(start), schedules == "restart") if start else optimizer
+        for start in {0, *starts.values()}
     }
 
     def label(params):
-        numbers = {pattern: number for number, pattern in enumerate(starts, start=1)}
-        return _claim(params, numbers, default=0)
+        return _claim(params, {key: int(start) for key, start in starts.items()}, default=0)
 
     return optax.partition(groups, _labels(label))
 
 
 def scale_learning_rates(
-    optimizer: optax.GradientTransformation, multipliers: Mapping[str, Any]
+    optimizer: optax.GradientTransformation, multipliers: Mapping[str | tuple[str, ...], Any]
 ) -> optax.GradientTransformationExtraArgs:
     """An optimiser whose updates of some leaves are multiplied by a factor.
 
     Args:
         optimizer: the optimiser; its update of a leaf is scaled, whatever it consists of.
-        multipliers: pattern -> factor, a scalar that may be traced. Leaves that no pattern names
-            have factor 1. For a factor of 0 use :func:`freeze`, which keeps no memory.
+        multipliers: pattern, or a tuple of patterns as :func:`transfer.select` takes them ->
+            factor, a scalar that may be traced. Leaves that no pattern names have factor 1. For a
+            factor of 0 use :func:`freeze`, which keeps no memory.
 
     Raises:
         ValueError: at the first update, where a pattern matches nothing or two match one leaf.
@@ -167,10 +202,10 @@ def scale_learning_rates(
     return optax.with_extra_args_support(optax.chain(optimizer, scaling))
 
 
-def _claim(tree: PyTree, values: Mapping[str, Any], *, default: Any) -> dict[str, Any]:
+def _claim(tree: PyTree, values: Mapping[Any, Any], *, default: Any) -> dict[str, Any]:
     """The value whose pattern matches each leaf, by path; an error where two do."""
     names = paths(tree)
-    claimed: dict[str, str] = {}
+    claimed: dict[str, Any] = {}
     for pattern in values:
         for path in sorted(match_paths(names, pattern)):
             if path in claimed:
@@ -192,20 +227,14 @@ def partition(tree: PyTree, where: Where) -> tuple[PyTree, PyTree]:
     >>> jax.grad(lambda part: (combine(part, frozen)["head"] ** 2).sum())(trained)
     {'encoder': None, 'head': Array([2.], dtype=float32)}
     """
-    chosen = selected(tree, where)
-    names = iter(paths(tree))
-    leaves, structure = jax.tree.flatten(tree)
-    flags = [is_array(leaf) and next(names) in chosen for leaf in leaves]
-    first = [leaf if flag else None for leaf, flag in zip(leaves, flags, strict=True)]
-    second = [None if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)]
-    return structure.unflatten(first), structure.unflatten(second)
+    return split(tree, selected(tree, where))
 
 
 def combine(*parts: PyTree) -> PyTree:
     """The tree that :func:`partition` split.
 
     Raises:
-        ValueError: two parts hold the same leaf.
+        ValueError: two parts hold the same leaf, or differ in structure.
 
     >>> combine({"a": 1.0, "b": None}, {"a": None, "b": 2.0})
     {'a': 1.0, 'b': 2.0}
@@ -217,7 +246,7 @@ def combine(*parts: PyTree) -> PyTree:
             raise ValueError(f"Expected each leaf in one part, found one in {len(there)} of them.")
         return there[0] if there else None
 
-    return jax.tree.map(choose, *parts, is_leaf=lambda leaf: leaf is None)
+    return join(choose, parts)
 
 
 def stop_gradient(tree: PyTree, where: Where) -> PyTree:

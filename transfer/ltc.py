@@ -61,13 +61,18 @@ class Classification(NamedTuple):
 
     Attributes:
         labels: int32 [S], the task, or ``NOVEL`` (-1).
-        votes: int32 [S], the task that the neighbours vote for, whatever the distance.
-        distances: float32 [S], the Manhattan distance to the nearest sample.
+        votes: int32 [S], the task that the neighbours vote for, whatever the distance; ``NOVEL``
+            for a latent that is not finite, which has no neighbours.
+        distances: float32 [S], the Manhattan distance to the nearest sample; infinite for a latent
+            that is not finite.
+        finite: bool [S], whether every number of the latent is finite. One that is not, as a
+            diverged model gives it, is novel.
     """
 
     labels: Array
     votes: Array
     distances: Array
+    finite: Array
 
 
 class Accuracy(NamedTuple):
@@ -78,11 +83,13 @@ class Accuracy(NamedTuple):
             the right task, both.
         not_novel: within the threshold of a known sample.
         right_task: voted for the right task, whatever the distance; 0 for a novel task.
+        not_finite: latents that are not finite, which are taken for novel.
     """
 
     correct: Array
     not_novel: Array
     right_task: Array
+    not_finite: Array
 
 
 def fit(latents: Any, labels: Any, *, neighbours: int = NEIGHBOURS) -> Classifier:
@@ -98,9 +105,10 @@ def fit(latents: Any, labels: Any, *, neighbours: int = NEIGHBOURS) -> Classifie
             latent that is not finite (values are checked outside ``jit`` only).
 
     >>> model = fit([[0.0], [1.0], [9.0]], [0, 0, 1], neighbours=1)
-    >>> classify(model, jnp.array([[0.4], [8.0], [30.0]]), threshold=2.0)
-    Classification(labels=Array([ 0,  1, -1], dtype=int32), votes=Array([0, 1, 1], dtype=int32), \
-distances=Array([ 0.4,  1. , 21. ], dtype=float32))
+    >>> result = classify(model, jnp.array([[0.4], [8.0], [30.0]]), threshold=2.0)
+    >>> result.labels, result.votes, result.distances
+    (Array([ 0,  1, -1], dtype=int32), Array([0, 1, 1], dtype=int32), \
+Array([ 0.4,  1. , 21. ], dtype=float32))
     """
     latents, labels = jnp.asarray(latents, jnp.float32), jnp.asarray(labels)
     if latents.ndim != 2 or labels.shape != latents.shape[:1]:
@@ -172,27 +180,36 @@ def vote(labels: Array) -> Array:
     return jnp.where(winners, labels, jnp.iinfo(labels.dtype).max).min(-1)
 
 
-@jax.jit
 def classify(model: Classifier, latents: Array, threshold: Any) -> Classification:
     """The task of each latent state, or ``NOVEL`` (equation 22).
 
     Args:
         model: from :func:`fit`.
-        latents: float [S, M].
+        latents: float [S, M]. One that holds NaN or infinity is novel.
         threshold: ξ, a scalar: the task is novel if the nearest sample is farther.
 
     Raises:
-        ValueError: latents of another M, or a threshold that is not a scalar.
+        ValueError: latents of another M, or a threshold that is not a scalar, or is NaN (where it
+            is concrete; a traced NaN makes every task novel).
     """
+    if not isinstance(threshold, jax.core.Tracer) and np.isnan(threshold).any():
+        raise ValueError(f"Expected a threshold that is a number, got {threshold}.")
+    return _classify(model, latents, threshold)
+
+
+@jax.jit
+def _classify(model: Classifier, latents: Array, threshold: Any) -> Classification:
     if jnp.ndim(threshold):
         raise ValueError(
             f"Expected one threshold, got shape {jnp.shape(threshold)}; map over several with "
             "jax.vmap(classify, in_axes=(None, None, 0))."
         )
     neighbours = nearest(model, latents)
-    votes = vote(neighbours.labels)
-    distances = neighbours.distances[:, 0]
-    return Classification(jnp.where(distances > threshold, NOVEL, votes), votes, distances)
+    finite = jnp.isfinite(jnp.asarray(latents, jnp.float32)).all(axis=-1)
+    votes = jnp.where(finite, vote(neighbours.labels), NOVEL)
+    distances = jnp.where(finite, neighbours.distances[:, 0], jnp.inf)
+    known = finite & (distances <= threshold)
+    return Classification(jnp.where(known, votes, NOVEL), votes, distances, finite)
 
 
 def accuracy(result: Classification, task: Any) -> Accuracy:
@@ -202,14 +219,16 @@ def accuracy(result: Classification, task: Any) -> Accuracy:
         result: from :func:`classify`, of samples of one task.
         task: int scalar, the true task, or ``NOVEL``; or [S], where samples are of several.
 
-    >>> result = Classification(*map(jnp.array, ([0, NOVEL, 1], [0, 0, 1], [3.0, 90.0, 5.0])))
+    >>> found = [0, NOVEL, 1], [0, 0, 1], [3.0, 90.0, 5.0], [True, True, True]
+    >>> result = Classification(*map(jnp.array, found))
     >>> accuracy(result, 0).correct.item(), accuracy(result, NOVEL).correct.item()
     (0.3333333432674408, 0.3333333432674408)
     """
     return Accuracy(
         correct=(result.labels == task).mean(dtype=jnp.float32),
         not_novel=(result.labels != NOVEL).mean(dtype=jnp.float32),
-        right_task=(result.votes == task).mean(dtype=jnp.float32),
+        right_task=((result.votes == task) & (result.votes != NOVEL)).mean(dtype=jnp.float32),
+        not_finite=(~result.finite).mean(dtype=jnp.float32),
     )
 
 

@@ -1,44 +1,114 @@
-"""Plans: which operation happens to which leaf, as data, and a report of what it did.
+"""Plans: which operation happens to which leaf, as data.
 
 A :class:`Plan` is a list of rules (patterns -> operation). Every leaf of the target must be claimed
 by exactly one rule, or by the plan's explicit default: what a plan forgets is an error, and so is
-what it says twice. Plans are values: they print, compare, and go to YAML or JSON and back (see
-:mod:`transfer.plan_files`).
-
-Axis letters: P population member.
+what it says twice. Plans are values: they print, compare, hash, cannot be changed, and go to YAML
+or JSON and back (see :mod:`transfer.plan_files`). :func:`transfer.apply` carries one out.
 """
 
 import dataclasses
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-from transfer import population as populations
-from transfer import surgery
-from transfer.leaves import find, key_ndim, repeat
-from transfer.report import Report, Row, measure
-from transfer.select import Mask, PyTree, flatten, mask_of, match_paths, paths
+from transfer import layout as layouts
+from transfer.patterns import captures, match_paths
+from transfer.select import Mask, PyTree, mask_of, paths
 
-Operations = Mapping[str, Callable[..., PyTree]]
 
-OPERATIONS: Operations = {
-    operation.__name__: operation
-    for operation in (
-        surgery.keep,
-        surgery.copy,
-        surgery.fraction,
-        surgery.interpolate,
-        surgery.shrink_perturb,
-        surgery.reinitialise,
-        surgery.take,
-        surgery.splice,
-        surgery.pad,
-        surgery.crop,
-        surgery.average,
-    )
-}
+class Parameters(Mapping[str, Any]):
+    """A mapping that cannot be changed, with a hash."""
+
+    __slots__ = ("_items",)
+
+    def __init__(self, items: Mapping[str, Any]):
+        object.__setattr__(self, "_items", dict(items))
+
+    def __getitem__(self, name: str) -> Any:
+        return self._items[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError("The parameters of a rule cannot be changed; make another rule.")
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self._items.items()))
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, Mapping) and self._items == dict(other)
+
+    def __repr__(self) -> str:
+        return repr(self._items)
+
+    def __reduce__(self):
+        return Parameters, (self._items,)
+
+
+def _value(name: str, value: Any) -> Any:
+    """A parameter as a value that cannot change: lists and arrays become tuples."""
+    if value is None or isinstance(value, bool | int | float | complex | str):
+        return value
+    if isinstance(value, jax.core.Tracer):
+        raise ValueError(
+            f"{name} is traced, and a plan holds values; leave it open and give it to apply."
+        )
+    if isinstance(value, slice):
+        ends = (value.start, value.stop, *(() if value.step is None else (value.step,)))
+        return ":".join("" if end is None else str(end) for end in ends)
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise ValueError(f"{name} has the key {key!r}; expected names as strings.")
+        return Parameters({key: _value(f"{key!r} in {name}", value[key]) for key in value})
+    if hasattr(value, "dtype") and hasattr(value, "shape"):
+        return _tuples(np.asarray(value))
+    if isinstance(value, Sequence):
+        return tuple(_value(name, item) for item in value)
+    try:
+        hash(value)
+    except TypeError:
+        raise ValueError(
+            f"{name} cannot be part of a plan, which is a value: {value!r}. Leave it open and give "
+            "it to apply."
+        ) from None
+    return value
+
+
+def _tuples(array: np.ndarray) -> Any:
+    """An array as nested tuples; 0.2 of float32 as 0.2, which is the same float32."""
+    if array.ndim:
+        return tuple(_tuples(item) for item in array)
+    if jnp.issubdtype(array.dtype, jnp.floating) and array.dtype != np.float64:
+        return float(str(array[()]))
+    return array[()].item()
+
+
+class Reading(NamedTuple):
+    """Where a rule reads: which source (``None``: the only one) and which path (``None``: the
+    target's own)."""
+
+    name: str | None
+    path: str | None
+
+
+_CAPTURED = re.compile(r"(?<!\\)\{(\w+)(?::\*\*)?\}")
+
+
+def _reading(text: str) -> Reading:
+    text = _CAPTURED.sub(r"{\1}", text)
+    if ":" in text:
+        name, _, path = text.rpartition(":")
+        return Reading(name or None, path or None)
+    return Reading(None, text) if "/" in text or "{" in text else Reading(text, None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,13 +119,31 @@ class Rule:
         patterns: glob patterns, taken in order (see :func:`transfer.select`); one may be given as
             a plain string.
         operation: the name of an operation, such as ``"copy"``.
-        parameters: its keyword arguments. What is left out is given to :func:`apply` by name.
-        source: which source the rule reads where there are several, by name; a tuple of names for
-            ``average``. ``None`` where there is one source.
+        parameters: its keyword arguments. What is left out is given to :func:`transfer.apply` by
+            name. A number may differ with depth, ``{"values": [0, 0.5, 1], "over": "layer"}``: the
+            values are spread evenly over what ``{layer}`` in the pattern stands for, in between
+            linearly.
+        source: where the rule reads; ``None`` for the same path of the only source.
+
+            * ``"teacher"``: the same path of the source of that name, where there are several;
+            * ``"blk/{i}/attn/{rest}"``: another path of the only source, with what ``{i}`` and
+              ``{rest}`` in the pattern stand for. A path of a single part is written ``":weight"``;
+            * ``"teacher:blk/{i}/w"``: both. A name that holds a ``/`` ends with ``:``.
+
+            A tuple names one source each for operations on several (``average``); for others it
+            names several leaves, or a path with ``*`` does, that the layout's first step joins.
         optional: whether the patterns may match nothing (a head that not every agent has).
         frozen: whether the leaves are meant to stay as they are in training. ``apply`` only says
             so in its report; :func:`frozen` gives the mask that ``freeze`` acts on.
         note: a word to the reader of the plan.
+        layout: steps from the arrays that are read to the one the operation takes, see
+            :mod:`transfer.layout`.
+
+    Lists and arrays among these become tuples, so that a rule is a value that never changes.
+
+    Raises:
+        ValueError: a field of the wrong type, a captured part that no pattern has, or a layout
+            with an unknown step.
     """
 
     patterns: tuple[str, ...]
@@ -65,18 +153,70 @@ class Rule:
     optional: bool = False
     frozen: bool = False
     note: str = ""
+    layout: tuple[Any, ...] = ()
 
     def __post_init__(self):
-        patterns = (self.patterns,) if isinstance(self.patterns, str) else tuple(self.patterns)
-        source = tuple(self.source) if isinstance(self.source, list) else self.source
-        object.__setattr__(self, "patterns", patterns)
-        object.__setattr__(self, "source", source)
-        object.__setattr__(self, "parameters", dict(self.parameters))
-        if not patterns or not all(isinstance(pattern, str) for pattern in patterns):
+        patterns = (self.patterns,) if isinstance(self.patterns, str) else self.patterns
+        if (
+            not isinstance(patterns, Sequence)
+            or not patterns
+            or not all(isinstance(pattern, str) for pattern in patterns)
+        ):
             raise ValueError(
                 f"A rule needs one pattern or several, as strings; the rule for "
                 f"{self.operation!r} got {self.patterns!r}."
             )
+        what = f"the rule for {', '.join(patterns)}"
+        for name, kind, word in (
+            ("operation", str, "a name"),
+            ("parameters", Mapping, "a mapping"),
+            ("optional", bool, "true or false"),
+            ("frozen", bool, "true or false"),
+            ("note", str, "text"),
+        ):
+            _check_type(what, name, getattr(self, name), kind, word)
+        source = tuple(self.source) if isinstance(self.source, list) else self.source
+        for text in source if isinstance(source, tuple) else (source,):
+            if text is not None or source == ():
+                _check_type(what, "source", text, str, "a name, or several")
+        layout = (self.layout,) if isinstance(self.layout, str | Mapping) else self.layout
+        layouts.steps(layout)
+        object.__setattr__(self, "patterns", tuple(patterns))
+        object.__setattr__(self, "source", source)
+        object.__setattr__(self, "layout", _value(f"layout of {what}", layout))
+        object.__setattr__(self, "parameters", _value(f"a parameter of {what}", self.parameters))
+        self._check_captures()
+
+    def _check_captures(self) -> None:
+        used = set(layouts.captured_names(self.layout))
+        for _, path in self.readings:
+            used |= set(_CAPTURED.findall(path or ""))
+        used |= {over for _, over in self._gradients()}
+        for pattern in self.patterns:
+            if pattern.startswith("!"):
+                continue
+            if missing := sorted(used - set(_CAPTURED.findall(pattern))):
+                raise ValueError(
+                    f"The rule '{self}' uses {{{missing[0]}}}, which its pattern {pattern!r} does "
+                    "not capture."
+                )
+
+    def _gradients(self) -> list[tuple[str, str]]:
+        return [(name, p["over"]) for name, p in self.parameters.items() if is_gradient(p)]
+
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """What ``source`` says, entry by entry; one empty entry where it says nothing."""
+        if self.source is None:
+            return (Reading(None, None),)
+        return tuple(map(_reading, (self.source,) if isinstance(self.source, str) else self.source))
+
+    def captured(self, path: str) -> dict[str, str]:
+        """What the captured parts of the rule's patterns stand for in a path that it claims."""
+        for pattern in self.patterns:
+            if not pattern.startswith("!") and (found := captures(pattern, path)) is not None:
+                return found
+        return {}
 
     def __str__(self) -> str:
         return f"{', '.join(self.patterns)} -> {self.operation}"
@@ -86,7 +226,21 @@ class Rule:
         arguments = [f"{name}={value}" for name, value in self.parameters.items()]
         if self.source is not None:
             arguments.append(f"source={self.source}")
+        if self.layout:
+            arguments.append(f"layout={list(self.layout)}")
         return f"{self.operation}({', '.join(arguments)})" + (", frozen" if self.frozen else "")
+
+
+def is_gradient(value: Any) -> bool:
+    """Whether a parameter is ``{"values": ..., "over": name}``."""
+    return isinstance(value, Mapping) and set(value) == {"values", "over"}
+
+
+def _check_type(what: str, name: str, value: Any, kind: type, word: str) -> None:
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"{name} of {what} is {value!r} ({type(value).__name__}); expected {word}."
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +258,7 @@ class Plan:
     body/**  copy()
     head/**  fraction(omega=0.5)
     >>> tree = {"body": {"w": jnp.ones(2)}, "head": {"w": jnp.ones(2)}}
-    >>> new, report = apply(plan, tree, tree)
+    >>> new, report = transfer.apply(plan, tree, tree)
     >>> new
     {'body': {'w': Array([1., 1.], dtype=float32)}, 'head': {'w': Array([1.5, 1.5], dtype=float32)}}
     """
@@ -114,7 +268,13 @@ class Plan:
     name: str = ""
 
     def __post_init__(self):
+        if isinstance(self.rules, Rule):
+            raise ValueError("A plan takes a list of rules, got one rule.")
         object.__setattr__(self, "rules", tuple(self.rules))
+        for rule in self.rules:
+            _check_type("a plan", "a rule", rule, Rule, "a Rule")
+        _check_type("a plan", "default", self.default, str | None, "the name of an operation")
+        _check_type("a plan", "name", self.name, str, "text")
 
     def __str__(self) -> str:
         rows = [(", ".join(rule.patterns), rule.describe(), rule.note) for rule in self.rules]
@@ -167,188 +327,4 @@ def frozen(plan: Plan, tree: PyTree) -> Mask:
     return mask_of(tree, (path for path, rule in claims(plan, tree).items() if rule.frozen))
 
 
-def source_leaves(
-    plan: Plan, target: PyTree, source: PyTree, *, operations: Operations = OPERATIONS
-) -> dict[str, Any]:
-    """The leaves of a source that the plan reads, as a flat ``{path: array}``.
-
-    Sources that differ where the plan does not look (another action size) are alike in these, so
-    they can be stacked; the result is a valid source for :func:`apply`. For plans of one source.
-
-    Raises:
-        ValueError: as :func:`claims`, or a leaf the plan reads that the source has not.
-    """
-    flat = flatten(source)
-    return {
-        path: find(flat, path)
-        for path, rule in claims(plan, target).items()
-        if "source" in _signature(rule, operations)
-    }
-
-
-def apply(
-    plan: Plan,
-    target: PyTree,
-    source: PyTree = None,
-    *,
-    key: jax.Array | None = None,
-    population: bool = False,
-    operations: Operations = OPERATIONS,
-    **parameters: Any,
-) -> tuple[PyTree, Report]:
-    """Carry out a plan.
-
-    Args:
-        plan: the plan.
-        target: the tree to change; never altered.
-        source: the tree that knowledge comes from; where rules name their sources, a mapping
-            ``{name: tree}``.
-        key: one PRNG key, for the operations that draw. Leaves draw independently.
-        population: whether the target's leaves are stacked on a leading axis P. Source leaves may
-            be stacked too or shared by all members; parameters may be scalars or [P]; each member
-            gets a key of its own; the report has a row of numbers for each member.
-        operations: what the names in the plan mean; extend ``OPERATIONS`` with your own.
-        **parameters: values for what the rules leave open, such as ``omega=0.2``; they go to
-            every rule whose operation has a parameter of this name that the plan does not set.
-
-    Returns:
-        The new tree and a :class:`Report`. Under ``vmap`` both get a leading axis.
-
-    Raises:
-        ValueError: as :func:`claims`; or a parameter, key or source that is missing or unused; or
-            as the operations.
-    """
-    claimed = claims(plan, target)
-    before = flatten(target)
-    members = populations.size(target) if population else None
-    if population and key is not None and key.ndim == key_ndim(key):
-        key = jax.random.split(key, members)
-    rules = tuple({id(rule): rule for rule in claimed.values()}.values())
-    read: dict[str, Any] = {}
-    arguments = []
-    result = target
-    for rule in rules:
-        mine = [path for path in before if claimed[path] is rule]
-        signature = _signature(rule, operations)
-        arguments.append(_arguments(rule, signature, parameters))
-        trees = _sources(plan, rule, signature, source)
-        if population:
-            trees = [_repeat_shared(tree, before, mine, members) for tree in trees]
-        several = "sources" in signature
-        inputs = [trees] if several else trees
-        if trees and not several:
-            read |= {path: trees[0][path] for path in mine if path in trees[0]}
-        keywords = dict(arguments[-1])
-        if "key" in signature:
-            if key is None:
-                raise ValueError(f"The rule '{rule}' draws random numbers; give apply a key.")
-            keywords |= {"key": key}
-        where = mask_of(result, mine)
-        result = operations[rule.operation](result, *inputs, where=where, **keywords)
-    _check_all_used(plan, rules, arguments, parameters)
-    rows = [
-        Row(
-            leaf=path,
-            rule=", ".join(claimed[path].patterns),
-            operation=claimed[path].operation,
-            shape=leaf.shape,
-            frozen=claimed[path].frozen,
-            rule_number=next(n for n, rule in enumerate(rules) if rule is claimed[path]),
-        )
-        for path, leaf in before.items()
-    ]
-    return result, measure(rows, arguments, before, flatten(result), read, members=members)
-
-
-def _signature(rule: Rule, operations: Operations) -> Mapping[str, inspect.Parameter]:
-    if rule.operation not in operations:
-        raise ValueError(
-            f"The rule '{rule}' names no known operation; expected one of {', '.join(operations)}."
-        )
-    return inspect.signature(operations[rule.operation]).parameters
-
-
-def _arguments(
-    rule: Rule, signature: Mapping[str, inspect.Parameter], parameters: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The keyword arguments of a rule's operation: from the plan, else from the caller."""
-    names = [
-        name
-        for name, parameter in signature.items()
-        if parameter.kind is inspect.Parameter.KEYWORD_ONLY and name not in ("where", "key")
-    ]
-    for name in rule.parameters:
-        if name not in names:
-            raise ValueError(
-                f"The rule '{rule}' sets {name!r}; the parameters of {rule.operation} are "
-                f"{', '.join(names) or 'none'}."
-            )
-    given = {name: parameters[name] for name in names if name in parameters} | rule.parameters
-    for name in names:
-        if name not in given and signature[name].default is inspect.Parameter.empty:
-            raise ValueError(
-                f"The rule '{rule}' leaves {name!r} open; set it in the plan or give apply "
-                f"{name}=..."
-            )
-    return given
-
-
-def _check_all_used(
-    plan: Plan, rules: Sequence[Rule], arguments: Sequence[Mapping], parameters: Mapping[str, Any]
-) -> None:
-    used = {
-        name
-        for rule, given in zip(rules, arguments, strict=True)
-        for name in set(given) - set(rule.parameters)
-    }
-    if unused := sorted(set(parameters) - used):
-        raise ValueError(
-            f"No rule leaves the parameter {', '.join(unused)} open to be given. The plan is:\n"
-            f"{plan}"
-        )
-
-
-def _sources(
-    plan: Plan, rule: Rule, signature: Mapping[str, inspect.Parameter], source: PyTree
-) -> list[dict[str, Any]]:
-    """The trees that a rule reads, flat: none, one, or as many as it names."""
-    several = "sources" in signature
-    if not several and "source" not in signature:
-        return []
-    if source is None:
-        raise ValueError(f"The rule '{rule}' reads a source; give apply one.")
-    if not any(other.source is not None for other in plan.rules):
-        if several:
-            raise ValueError(
-                f"The rule '{rule}' reads several sources; name them in the rule, as in "
-                "source=('first', 'second'), and give apply {name: tree}."
-            )
-        return [flatten(source)]
-    if not isinstance(source, Mapping):
-        raise ValueError(
-            f"Rules of the plan name their sources; give apply {{name: tree}}, "
-            f"got {type(source).__name__}."
-        )
-    if rule.source is None or isinstance(rule.source, tuple) is not several:
-        wanted = "a tuple of source names" if several else "the name of one source"
-        raise ValueError(
-            f"The rule '{rule}' needs {wanted}, got {rule.source!r}; given are {', '.join(source)}."
-        )
-    names = rule.source if several else (rule.source,)
-    for name in names:
-        if name not in source:
-            raise ValueError(
-                f"The rule '{rule}' reads the source {name!r}; given are {', '.join(source)}."
-            )
-    return [flatten(source[name]) for name in names]
-
-
-def _repeat_shared(source: dict, target: dict, names: list[str], members: int) -> dict[str, Any]:
-    """The source with those named leaves repeated that all members share.
-
-    They are the ones with one axis less than the target's.
-    """
-    shared = [
-        path for path in names if path in source and source[path].ndim == target[path].ndim - 1
-    ]
-    return source | {path: repeat(source[path], members) for path in shared}
+Operations = Mapping[str, Callable[..., PyTree]]

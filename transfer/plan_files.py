@@ -11,9 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import yaml
-
 from transfer.plan import Plan, Rule
 
 _RULE_FIELDS = tuple(field.name for field in dataclasses.fields(Rule))
@@ -49,14 +46,10 @@ def _rule_to_dict(rule: Rule) -> dict[str, Any]:
 def _plain(name: str, value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, slice) and value.step is None:
-        return ":".join("" if end is None else str(end) for end in (value.start, value.stop))
     if isinstance(value, Mapping):
         return {key: _plain(f"{key!r} in {name}", item) for key, item in value.items()}
     if isinstance(value, Sequence):
         return [_plain(name, item) for item in value]
-    if hasattr(value, "tolist") and not isinstance(value, jax.core.Tracer):
-        return value.tolist()
     raise ValueError(
         f"{name} cannot be written as data: {value!r}. Name it (an initializer), or leave it open "
         "and give it to apply."
@@ -71,7 +64,7 @@ def from_dict(data: Mapping[str, Any]) -> Plan:
 
     >>> from_dict({"rules": [{"patterns": ["head/*"], "operation": "keep"}], "default": "copy"})
     Plan(rules=(Rule(patterns=('head/*',), operation='keep', parameters={}, source=None, \
-optional=False, frozen=False, note=''),), default='copy', name='')
+optional=False, frozen=False, note='', layout=()),), default='copy', name='')
     """
     _check_entries(data, "a plan", required=("rules",), known=("name", "rules", "default"))
     if not isinstance(data["rules"], Sequence) or isinstance(data["rules"], str):
@@ -106,7 +99,7 @@ def write_plan(plan: Plan, path: str | os.PathLike) -> None:
     if _is_json(path):
         text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
     else:
-        text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+        text = _yaml().safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
     Path(path).write_text(text, encoding="utf-8")
 
 
@@ -114,15 +107,60 @@ def read_plan(path: str | os.PathLike) -> Plan:
     """The plan in a ``.json``, ``.yaml`` or ``.yml`` file.
 
     Raises:
-        ValueError: another suffix, a file that cannot be parsed, or as :func:`from_dict`.
+        ValueError: another suffix, a file that cannot be parsed or has a key twice, or as
+            :func:`from_dict`.
     """
-    is_json = _is_json(path)
-    text = Path(path).read_text(encoding="utf-8")
+    data = read_data(path)
     try:
-        data = json.loads(text) if is_json else yaml.safe_load(text)
         return from_dict(data)
-    except (ValueError, yaml.YAMLError) as error:
+    except ValueError as error:
         raise ValueError(f"{path} holds no plan: {error}") from error
+
+
+def read_data(path: str | os.PathLike) -> Any:
+    """What a ``.json``, ``.yaml`` or ``.yml`` file holds: numbers, text, lists and mappings.
+
+    Raises:
+        ValueError: another suffix, a file that cannot be parsed, or a mapping with a key twice.
+    """
+    if _is_json(path):
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+            return json.loads(text, object_pairs_hook=_without_repetition)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{path} holds no plan: {error}") from error
+    yaml = _yaml()
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node, deep=False):
+            keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+            _without_repetition([(str(key), None) for key in keys])
+            return super().construct_mapping(node, deep)
+
+    try:
+        return yaml.load(Path(path).read_text(encoding="utf-8"), Loader)
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise ValueError(f"{path} holds no plan: {error}") from error
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"the key {key!r} comes twice.")
+        found[key] = value
+    return found
+
+
+def _yaml() -> Any:
+    try:
+        import yaml
+    except ImportError:
+        raise ImportError(
+            "Plans in YAML need the package PyYAML: pip install 'dreamer-transfer[files]'. "
+            "Plans in JSON need nothing."
+        ) from None
+    return yaml
 
 
 def _is_json(path: str | os.PathLike) -> bool:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from transfer.leaves import beside, is_key, wide_dtype
 from transfer.select import PyTree
 
 Array = Any
@@ -28,6 +29,7 @@ class Row(NamedTuple):
         shape: its shape.
         frozen: whether the rule calls it frozen.
         rule_number: which entry of the report's ``settings`` and ``parameters`` is the rule's.
+        source: the path or paths that it was made from, where they are not its own.
         columns: the numbers that there are for it: no norm for PRNG keys, none of a source that
             was not read, no cosine to one of another shape.
     """
@@ -38,6 +40,7 @@ class Row(NamedTuple):
     shape: tuple[int, ...]
     frozen: bool
     rule_number: int
+    source: str | None = None
     columns: tuple[str, ...] = ()
 
 
@@ -53,6 +56,8 @@ class Report:
         norm_after: the same of the result, float32 [n].
         norm_source: the same of the source, float32 [n].
         cosine_to_source: cosine between result and source, float32 [n]; 0 where either is zero.
+        unread: the leaves of the source that no rule reads, as ``path``, or as ``name/path`` where
+            sources have names; static.
 
     Where a number does not exist (see :class:`Row`) the array holds NaN, the records ``None`` and
     the table a dash. For a population, or out of ``vmap``, all arrays have a leading axis P.
@@ -65,6 +70,7 @@ class Report:
     norm_after: Array
     norm_source: Array
     cosine_to_source: Array
+    unread: tuple[str, ...] = ()
 
     @property
     def members(self) -> int | None:
@@ -92,8 +98,10 @@ class Report:
                 "operation": row.operation,
                 "parameters": dict(self.settings[row.rule_number])
                 | {
-                    name: _floats(value) for name, value in self.parameters[row.rule_number].items()
+                    name: _floats(value[row.leaf] if isinstance(value, Mapping) else value)
+                    for name, value in self.parameters[row.rule_number].items()
                 },
+                "source": row.source,
                 "shape": row.shape,
                 "frozen": row.frozen,
                 **{
@@ -123,12 +131,18 @@ class Report:
         if self.members is not None:
             footer += f"; numbers are means over {self.members} members"
         rule = "-" * max(map(len, aligned))
-        return "\n".join([aligned[0], rule, *aligned[1:], rule, footer])
+        lines = [aligned[0], rule, *aligned[1:], rule, footer]
+        if self.unread:
+            more = f", ... ({len(self.unread)} in all)" if len(self.unread) > 8 else ""
+            lines.append(f"not read of the source: {', '.join(self.unread[:8])}{more}")
+        return "\n".join(lines)
 
     def _line(self, record: dict[str, Any]) -> tuple[str, ...]:
         arguments = ", ".join(
             f"{name}={_show(value)}" for name, value in record["parameters"].items()
         )
+        if record["source"] is not None:
+            arguments = ", ".join(filter(None, [arguments, f"from {record['source']}"]))
         return (
             record["leaf"],
             "x".join(map(str, record["shape"])) or "scalar",
@@ -144,7 +158,7 @@ class Report:
 _COLUMNS = ("norm_before", "norm_after", "norm_source", "cosine_to_source")
 
 jax.tree_util.register_dataclass(
-    Report, data_fields=["parameters", *_COLUMNS], meta_fields=["rows", "settings"]
+    Report, data_fields=["parameters", *_COLUMNS], meta_fields=["rows", "settings", "unread"]
 )
 
 
@@ -173,13 +187,20 @@ def _split_parameters(
     """Numbers, which may be traced, apart from settings, which are static and hashable."""
     numbers, settings = {}, []
     for name, value in arguments.items():
-        if _holds_numbers(value):
-            numbers[name] = jnp.asarray(value, jnp.float32)
-            if members is not None and numbers[name].shape[:1] != (members,):
-                numbers[name] = jnp.broadcast_to(numbers[name], (members, *numbers[name].shape))
+        if isinstance(value, dict) and value and all(map(_holds_numbers, value.values())):
+            numbers[name] = {path: _of_members(item, members) for path, item in value.items()}
+        elif _holds_numbers(value):
+            numbers[name] = _of_members(value, members)
         elif value is not None:
             settings.append((name, _static(value)))
     return numbers, tuple(settings)
+
+
+def _of_members(value: Any, members: int | None) -> Array:
+    array = jnp.asarray(value, jnp.float32)
+    if members is not None and array.shape[:1] != (members,):
+        return jnp.broadcast_to(array, (members, *array.shape))
+    return array
 
 
 def _holds_numbers(value: Any) -> bool:
@@ -201,38 +222,33 @@ def _static(value: Any) -> Any:
     return getattr(value, "__name__", str(value))
 
 
-def measure(
+def summarise(
     rows: Sequence[Row],
     arguments: Sequence[Mapping[str, Any]],
-    before: Mapping[str, Array],
-    after: Mapping[str, Array],
-    source: Mapping[str, Array],
+    measured: Mapping[str, Mapping[str, Array]],
     *,
     members: int | None = None,
+    unread: tuple[str, ...] = (),
 ) -> Report:
     """The report of a change.
 
     Args:
         rows: one per leaf, in tree order.
         arguments: the keyword arguments of each rule's operation.
-        before: the target's leaves by path.
-        after: the result's leaves by path.
-        source: the source's leaves that were read, by path.
+        measured: the numbers of the leaves by column and path, from :func:`measure_leaves`.
         members: P where leaves are stacked on a leading axis.
+        unread: the leaves of the source that no rule reads.
     """
     split = [_split_parameters(values, members) for values in arguments]
-    before, after, source = map(_numbers, (before, after, source))
-    comparable = {path: x for path, x in source.items() if x.shape == after[path].shape}
-    measured = _measure(before, after, source, comparable, population=members is not None)
-    missing = jnp.full(() if members is None else (members,), jnp.nan)
-    columns = {
-        name: jnp.stack([found.get(row.leaf, missing) for row in rows], axis=-1)
-        if rows
-        else missing
-        for name, found in measured.items()
-    }
+    missing = np.full(() if members is None else (members,), np.nan, np.float32)
+    columns = {}
+    for name in _COLUMNS:
+        column = [measured.get(name, {}).get(row.leaf, missing) for row in rows]
+        # Nothing is compiled for a report without numbers.
+        library = jnp if any(isinstance(value, jax.Array) for value in column) else np
+        columns[name] = library.stack(column, axis=-1) if rows else missing
     rows = [
-        row._replace(columns=tuple(name for name in _COLUMNS if row.leaf in measured[name]))
+        row._replace(columns=tuple(name for name in _COLUMNS if row.leaf in measured.get(name, {})))
         for row in rows
     ]
     return Report(
@@ -240,12 +256,33 @@ def measure(
         settings=tuple(settings for _, settings in split),
         parameters=tuple(numbers for numbers, _ in split),
         **columns,
+        unread=unread,
     )
+
+
+def measure_leaves(
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+    source: Mapping[str, Array],
+    *,
+    population: bool,
+) -> dict[str, dict[str, Array]]:
+    """The numbers of a report: column -> path -> float32, a scalar or [P].
+
+    Args:
+        before: the target's leaves by path.
+        after: the result's leaves by path.
+        source: the source's leaves that were read, by path.
+        population: whether leaves are stacked on a leading axis P.
+    """
+    before, after, source = map(_numbers, (before, after, source))
+    source = {path: beside(leaf, after[path]) for path, leaf in source.items()}
+    comparable = {path: x for path, x in source.items() if x.shape == after[path].shape}
+    return _measure(before, after, source, comparable, population=population)
 
 
 def _numbers(leaves: Mapping[str, Array]) -> dict[str, Array]:
     """The leaves without PRNG keys."""
-    is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)  # noqa: E731
     return {path: leaf for path, leaf in leaves.items() if not is_key(leaf)}
 
 
@@ -255,7 +292,7 @@ def _measure(
     before: PyTree, after: PyTree, source: PyTree, comparable: PyTree, *, population: bool
 ) -> dict[str, dict[str, Array]]:
     def inner(a, b):
-        a, b = (x.astype(jnp.promote_types(x.dtype, jnp.float32)) for x in (a, b))
+        a, b = (x.astype(wide_dtype(x.dtype)) for x in (a, b))
         products = jnp.real(a * jnp.conj(b)).astype(jnp.float32)
         return products.sum(axis=tuple(range(1, a.ndim)) if population else None)
 

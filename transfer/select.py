@@ -3,15 +3,11 @@
 A leaf's *path* is its JAX key path joined by '/': ``reward/out/kernel`` in nested dictionaries,
 ``layers/0/weight`` in an Equinox module, ``0/mu/reward/out/kernel`` in the state of an Optax chain.
 The box that Flax NNX puts around an array (``nnx.Variable``) is not part of the path, so the same
-layer has the same path in linen and in NNX.
+layer has the same path in linen and in NNX. An array that an NNX module holds in two places (tied
+weights) is one leaf, as in ``nnx.state``: it has the path of the first place, and what changes it
+changes both.
 
-A *pattern* is a glob over the parts of a path:
-
-====================  ======================================================
-``reward/out/*``      ``*`` and ``?`` and ``[ab]`` match inside one part
-``dynamics/**``       ``**`` stands for any number of parts, none included
-``!dynamics/gru/*``   ``!`` takes leaves away from what came before it
-====================  ======================================================
+Patterns over paths are described in :mod:`transfer.patterns`.
 
 A *mask* is the same pytree with a ``bool`` in place of every leaf. Selections are static: they
 depend on the structure of a tree and never on its values, so they cost nothing under ``jit``.
@@ -20,14 +16,15 @@ Only arrays are leaves here. Python numbers, strings and functions inside a tree
 an Equinox module) are settings: they have no path, no mask selects them, no operation moves them.
 """
 
-import difflib
-import fnmatch
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
+import numpy as np
+
+from transfer.patterns import is_list, match_paths, pattern_list, suggest
 
 PyTree = Any
 Mask = Any
@@ -46,23 +43,51 @@ def _is_nnx_variable(node: Any) -> bool:
     return nnx is not None and isinstance(node, nnx.Variable)
 
 
-def _entries(tree: PyTree) -> list[tuple[str, Any]]:
-    """(path, leaf) of every JAX leaf in tree order, those that are not arrays included."""
+class Leaves(Mapping[str, Any]):
+    """A flat ``{path: array}`` whose arrays are made when they are asked for, such as a file's.
+
+    Every operation takes one as a source. A subclass has ``shapes``, which say what is there
+    without making it.
+    """
+
+    @property
+    def shapes(self) -> Mapping[str, jax.ShapeDtypeStruct]:
+        """Shape and dtype of every array, by path."""
+        raise NotImplementedError
+
+
+class _Entry(NamedTuple):
+    """A JAX leaf of a tree. ``tied``: the same array came before, under this path."""
+
+    path: str
+    leaf: Any
+    tied: bool = False
+
+
+def _entries(tree: PyTree) -> list[_Entry]:
+    """Every JAX leaf in tree order, those that are not arrays included."""
     boxes, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_nnx_variable)
-    entries = []
+    entries: list[_Entry] = []
+    first_of: dict[int, list[_Entry]] = {}
     for key_path, box in boxes:
         path = jax.tree_util.keystr(key_path, simple=True, separator="/")
         if not _is_nnx_variable(box):
-            entries.append((path, box))
+            entries.append(_Entry(path, box))
+            continue
+        if id(box) in first_of:
+            entries += [entry._replace(tied=True) for entry in first_of[id(box)]]
             continue
         inner, _ = jax.tree_util.tree_flatten_with_path(box)
-        for inner_path, leaf in inner:
-            name = jax.tree_util.keystr(inner_path, simple=True, separator="/")
-            entries.append((path if len(inner) == 1 else f"{path}/{name}", leaf))
+        names = [jax.tree_util.keystr(key, simple=True, separator="/") for key, _ in inner]
+        first_of[id(box)] = [
+            _Entry(path if len(inner) == 1 else f"{path}/{name}", leaf)
+            for name, (_, leaf) in zip(names, inner, strict=True)
+        ]
+        entries += first_of[id(box)]
     return entries
 
 
-def flatten(tree: PyTree) -> dict[str, Any]:
+def flatten(tree: PyTree) -> Mapping[str, Any]:
     """Every array of a tree by its path, in tree order.
 
     The result is itself a valid source for every operation, which looks its leaves up by path:
@@ -74,10 +99,13 @@ def flatten(tree: PyTree) -> dict[str, Any]:
     >>> flatten({"actor": {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}}).keys()
     dict_keys(['actor/bias', 'actor/kernel'])
     """
-    entries = [(path, leaf) for path, leaf in _entries(tree) if is_array(leaf)]
-    flat = dict(entries)
+    if isinstance(tree, Leaves):
+        return tree
+    entries = [entry for entry in _entries(tree) if is_array(entry.leaf) and not entry.tied]
+    flat = {entry.path: entry.leaf for entry in entries}
     if len(flat) < len(entries):
-        twice = sorted(path for path, n in Counter(path for path, _ in entries).items() if n > 1)
+        counts = Counter(entry.path for entry in entries)
+        twice = sorted(path for path, count in counts.items() if count > 1)
         raise ValueError(
             f"Two leaves of the tree have the same path: {', '.join(twice)}. "
             "Rename a key that holds a '/'."
@@ -85,8 +113,10 @@ def flatten(tree: PyTree) -> dict[str, Any]:
     return flat
 
 
-def unflatten(tree: PyTree, leaves: dict[str, Any]) -> PyTree:
+def unflatten(tree: PyTree, leaves: Mapping[str, Any]) -> PyTree:
     """``tree`` with the leaves named in ``leaves`` put in place of its own.
+
+    Tied weights of NNX modules stay tied.
 
     Raises:
         ValueError: a name in ``leaves`` is no path of the tree.
@@ -94,14 +124,34 @@ def unflatten(tree: PyTree, leaves: dict[str, Any]) -> PyTree:
     >>> unflatten({"a": jnp.zeros(2), "b": jnp.zeros(2)}, {"b": jnp.ones(2)})
     {'a': Array([0., 0.], dtype=float32), 'b': Array([1., 1.], dtype=float32)}
     """
-    names = set(flatten(tree))
+    entries = _entries(tree)
+    names = {entry.path for entry in entries if is_array(entry.leaf)}
     for path in leaves:
         if path not in names:
             raise ValueError(f"The tree has no leaf {path!r}{suggest(path, names)}.")
-    new = [
-        leaves[path] if is_array(leaf) and path in leaves else leaf for path, leaf in _entries(tree)
-    ]
-    return jax.tree.unflatten(jax.tree.structure(tree), new)
+    return _rebuild(
+        tree,
+        [
+            leaves[entry.path] if is_array(entry.leaf) and entry.path in leaves else entry.leaf
+            for entry in entries
+        ],
+    )
+
+
+def _rebuild(tree: PyTree, leaves: Sequence[Any]) -> PyTree:
+    """The tree with other JAX leaves. What it holds twice, it holds twice again."""
+    boxes, outer = jax.tree.flatten(tree, is_leaf=_is_nnx_variable)
+    if not any(map(_is_nnx_variable, boxes)):
+        return outer.unflatten(leaves)
+    remaining, filled, made = iter(leaves), [], {}
+    for box in boxes:
+        if not _is_nnx_variable(box):
+            filled.append(next(remaining))
+            continue
+        inner = jax.tree.structure(box)
+        new = inner.unflatten([next(remaining) for _ in range(inner.num_leaves)])
+        filled.append(made.setdefault(id(box), new))
+    return outer.unflatten(filled)
 
 
 def paths(tree: PyTree) -> tuple[str, ...]:
@@ -113,65 +163,14 @@ def paths(tree: PyTree) -> tuple[str, ...]:
     return tuple(flatten(tree))
 
 
-def match(pattern: str, path: str) -> bool:
-    """Whether a glob pattern (without ``!``) matches a whole path.
-
-    >>> match("dynamics/**/kernel", "dynamics/prior/out/kernel"), match("*/out", "reward/out/bias")
-    (True, False)
-    """
-    return _match_parts(pattern.split("/"), path.split("/") if path else [])
-
-
-def _match_parts(pattern: list[str], path: list[str]) -> bool:
-    if not pattern:
-        return not path
-    if pattern[0] == "**":
-        return any(_match_parts(pattern[1:], path[skip:]) for skip in range(len(path) + 1))
-    if not path or not fnmatch.fnmatchcase(path[0], pattern[0]):
-        return False
-    return _match_parts(pattern[1:], path[1:])
-
-
-def suggest(pattern: str, names: Iterable[str]) -> str:
-    """Near misses for an error message: leaves, and branches written as ``branch/**``."""
-    names = list(names)
-    branches = {
-        "/".join(name.split("/")[:depth]) + "/**"
-        for name in names
-        for depth in range(1, name.count("/") + 1)
-    }
-    near = difflib.get_close_matches(pattern.lstrip("!"), [*names, *sorted(branches)], n=4)
-    if near:
-        return f"; did you mean {', '.join(near)}?"
-    listed = ", ".join(names[:8]) + (f", ... ({len(names)} in all)" if len(names) > 8 else "")
-    return f"; the leaves are {listed or 'none'}"
-
-
-def match_paths(names: Sequence[str], *patterns: str, optional: bool = False) -> frozenset[str]:
-    """The names among ``names`` that the patterns select, taken in order.
-
-    Raises:
-        ValueError: a pattern matches no name at all, unless ``optional``; the message lists near
-            misses.
-    """
-    if not patterns:
-        raise ValueError("No pattern was given; '**' selects every leaf.")
-    chosen: set[str] = set(names) if patterns[0].startswith("!") else set()
-    for pattern in patterns:
-        found = {name for name in names if match(pattern.removeprefix("!"), name)}
-        if not found and not optional:
-            raise ValueError(f"Pattern {pattern!r} matches no leaf{suggest(pattern, names)}.")
-        chosen = chosen - found if pattern.startswith("!") else chosen | found
-    return frozenset(chosen)
-
-
-def select(tree: PyTree, *patterns: str, count: int | None = None) -> Mask:
+def select(tree: PyTree, *patterns: str | Sequence[str], count: int | None = None) -> Mask:
     """A mask of the leaves whose paths match the patterns.
 
     Args:
         tree: any pytree; of its arrays only the paths are read.
-        *patterns: glob patterns, applied in order: a plain one adds leaves, one that begins with
-            ``!`` takes them away. If the first begins with ``!``, all leaves are the start.
+        *patterns: glob patterns, or lists of them, applied in order: a plain one adds leaves, one
+            that begins with ``!`` takes them away. If the first begins with ``!``, all leaves are
+            the start.
         count: the number of leaves there ought to be.
 
     Returns:
@@ -189,7 +188,7 @@ def select(tree: PyTree, *patterns: str, count: int | None = None) -> Mask:
     if count is not None and len(chosen) != count:
         listed = ", ".join(name for name in names if name in chosen) or "none"
         raise ValueError(
-            f"Patterns {', '.join(map(repr, patterns))} select {len(chosen)} leaves, "
+            f"Patterns {', '.join(map(repr, pattern_list(patterns)))} select {len(chosen)} leaves, "
             f"expected {count}: {listed}."
         )
     return mask_of(tree, chosen)
@@ -198,8 +197,8 @@ def select(tree: PyTree, *patterns: str, count: int | None = None) -> Mask:
 def mask_of(tree: PyTree, chosen: Iterable[str]) -> Mask:
     """The mask that is ``True`` at exactly the given paths."""
     chosen = frozenset(chosen)
-    flags = [is_array(leaf) and path in chosen for path, leaf in _entries(tree)]
-    return jax.tree.unflatten(jax.tree.structure(tree), flags)
+    flags = [is_array(entry.leaf) and entry.path in chosen for entry in _entries(tree)]
+    return _rebuild(tree, flags)
 
 
 def selected(tree: PyTree, where: Where = None) -> frozenset[str]:
@@ -220,15 +219,47 @@ def selected(tree: PyTree, where: Where = None) -> frozenset[str]:
         return frozenset(names)
     if isinstance(where, str):
         return match_paths(names, where)
-    if isinstance(where, tuple | list) and where and all(isinstance(p, str) for p in where):
+    if is_list(where) and all(isinstance(pattern, str) for pattern in where):
         return match_paths(names, *where)
     same_structure("the mask", where, "the tree", tree)
+    entries = _entries(tree)
     flags = jax.tree.leaves(where)
+    for entry, flag in zip(entries, flags, strict=True):
+        if isinstance(flag, jax.core.Tracer) or not isinstance(flag, bool | np.bool_ | jax.Array):
+            raise ValueError(
+                f"{entry.path}: a mask holds True or False, known before tracing; got {flag!r}."
+            )
     return frozenset(
-        path
-        for (path, leaf), flag in zip(_entries(tree), flags, strict=True)
-        if is_array(leaf) and bool(flag)
+        entry.path
+        for entry, flag in zip(entries, flags, strict=True)
+        if is_array(entry.leaf) and bool(flag)
     )
+
+
+def split(tree: PyTree, chosen: Iterable[str]) -> tuple[PyTree, PyTree]:
+    """The tree with only the chosen leaves, and with all others; ``None`` for what is left out."""
+    chosen = frozenset(chosen)
+    entries = _entries(tree)
+    flags = [is_array(entry.leaf) and entry.path in chosen for entry in entries]
+    pairs = list(zip(entries, flags, strict=True))
+    first = _rebuild(tree, [entry.leaf if flag else None for entry, flag in pairs])
+    return first, _rebuild(tree, [None if flag else entry.leaf for entry, flag in pairs])
+
+
+def join(choose: Callable[..., Any], parts: Sequence[PyTree]) -> PyTree:
+    """``choose`` of the leaves of trees from :func:`split`, ``None`` being a leaf."""
+    is_box = lambda node: node is None or _is_nnx_variable(node)  # noqa: E731
+    flat = [jax.tree.flatten(part, is_leaf=is_box) for part in parts]
+    if len({structure for _, structure in flat}) != 1:
+        raise ValueError("The parts have different structures.")
+    made: dict[tuple[int, ...], Any] = {}
+    boxes = []
+    for together in zip(*(boxes for boxes, _ in flat), strict=True):
+        whole = jax.tree.map(choose, *together, is_leaf=lambda leaf: leaf is None)
+        # What every part holds twice stays one thing.
+        key = tuple(map(id, together))
+        boxes.append(made.setdefault(key, whole) if _is_nnx_variable(together[0]) else whole)
+    return flat[0][1].unflatten(boxes)
 
 
 def same_structure(name: str, tree: PyTree, other_name: str, other: PyTree) -> None:
