@@ -267,7 +267,7 @@ def _presets() -> dict[str, Config]:
                 batch_size=8, sequence_length=40, imagination_starts=128, **learns
             ),
             exploration=explores,
-            schedule=ScheduleConfig(environment_steps=200_000, supersample=4),
+            schedule=ScheduleConfig(environment_steps=300_000, supersample=4),
         ),
         "demo": Config(
             network=small,
