@@ -109,18 +109,11 @@ def arrange(images, *, method: Method | None = None):
     """
     if _resolved("arrange", method) == "library":
         return images
-    flat = images.reshape(-1, *images.shape[-3:])
-
+    rows = images.reshape(-1, *images.shape[-3:]).swapaxes(0, 1)
     # A loop, since XLA fuses nothing across one: the layers that follow would gather from the
     # images as they were.
-    def arrange_row(number, arranged):
-        row = _batch_last(lax.dynamic_slice_in_dim(flat, number, 1, axis=1))
-        return lax.dynamic_update_slice_in_dim(arranged, row, number, axis=1)
-
-    batch, height, width, channels = flat.shape
-    arranged = jnp.zeros((channels, height, width, batch), images.dtype)
-    arranged = lax.fori_loop(0, height, arrange_row, arranged)
-    return _batch_first(arranged).reshape(images.shape)
+    rows = lax.map(lambda row: row.transpose(1, 2, 0), rows)
+    return rows.transpose(3, 0, 1, 2).reshape(images.shape)
 
 
 def image_distance(prediction, images, *, method: Method | None = None):
