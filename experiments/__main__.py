@@ -15,6 +15,8 @@ import tyro
 from dreamer_jax import config as configs
 from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.host_memory import keep_freed_memory
+from dreamer_jax.integrity import DamagedError
+from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
 from experiments import commands, grid_commands
@@ -25,6 +27,7 @@ COMMANDS = {
     "evaluate": (commands.Evaluate, commands.evaluate),
     "classify": (commands.Classify, commands.classify),
     "report": (commands.Report, commands.report),
+    "verify": (commands.Verify, commands.verify),
     "table": (grid_commands.Tables, grid_commands.tables),
     "figure": (grid_commands.Figures, grid_commands.figures),
     "plan": (grid_commands.Plan, grid_commands.plan),
@@ -55,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         SimulatorError,
         NonFiniteError,
         CorruptCheckpointError,
+        DamagedError,
+        RecordsError,
     ) as error:
         print(f"error: {error}", file=sys.stderr)
         return FAILURE

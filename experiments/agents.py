@@ -71,7 +71,9 @@ def _meta_modules(agent: Agent, spec: RunSpec):
     return tuple(modules.items())
 
 
-def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
+def make_env(
+    spec: RunSpec, workers: int | None = None, timeout: float = envs.SIMULATOR_TIMEOUT
+) -> envs.Env:
     """The simulators of a run: one for every member and task."""
     return envs.make(
         spec.tasks,
@@ -80,6 +82,7 @@ def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
         action_repeat=spec.config.schedule.action_repeat,
         workers=workers,
         supersample=spec.config.schedule.supersample,
+        timeout=timeout,
     )
 
 

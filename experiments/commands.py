@@ -10,7 +10,8 @@ from typing import Literal
 import tyro
 
 from dreamer_jax.config import Config
-from experiments.exits import STOPPED, UsageError, usage_errors
+from dreamer_jax.locks import FolderLock
+from experiments.exits import FAILURE, STOPPED, UsageError, usage_errors
 from experiments.grid import SEEDS, Backend
 
 
@@ -66,8 +67,14 @@ class Train:
     samples of the known tasks."""
     resume: bool = False
     """Continue the run that the results folder holds."""
+    from_checkpoint: int | Literal["list"] | None = None
+    """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
+    lists what there is."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
+    simulator_timeout: float = 300.0
+    """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
+    and ended."""
     config: tyro.conf.OmitArgPrefixes[Config] = Config()
 
 
@@ -83,6 +90,8 @@ class Evaluate:
     """Write videos of an episode and of an open-loop prediction into the folder."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
+    simulator_timeout: float = 300.0
+    """Seconds after which a simulator that does not answer is taken for stuck."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +153,14 @@ class Report:
     """Of all results: the simulators."""
 
 
+@dataclass(frozen=True)
+class Verify:
+    """Compare results folders with the checksums in them, and name what is damaged."""
+
+    directories: tyro.conf.Positional[tuple[Path, ...]]
+    """Results folders, or folders of several."""
+
+
 def train(command: Train) -> int:
     """Trains a population."""
     from experiments.run import carry_out, make_run
@@ -168,7 +185,19 @@ def train(command: Train) -> int:
             switching=command.switching,
             threshold=command.threshold,
         )
-        run = make_run(spec, command.out, resume=command.resume, workers=command.workers)
+        if command.from_checkpoint == "list":
+            from experiments.verify import checkpoint_table
+
+            print(checkpoint_table(command.out))
+            return 0
+        run = make_run(
+            spec,
+            command.out,
+            resume=command.resume or command.from_checkpoint is not None,
+            workers=command.workers,
+            timeout=command.simulator_timeout,
+            from_checkpoint=command.from_checkpoint,
+        )
     if spec.sources:
         print((command.out / "transfer.txt").read_text())
     if carry_out(run) == "stopped":
@@ -203,8 +232,22 @@ def report(command: Report) -> int:
     return 0
 
 
+def verify(command: Verify) -> int:
+    """Compares results folders with their checksums."""
+    from experiments.verify import report_of
+
+    text, sound = report_of(command.directories)
+    print(text)
+    return 0 if sound else FAILURE
+
+
 def evaluate(command: Evaluate) -> int:
     """Plays episodes and prints their returns."""
+    with FolderLock(command.directory, ".evaluation.lock", make=False):
+        return _evaluate(command)
+
+
+def _evaluate(command: Evaluate) -> int:
     import numpy as np
     from rich.progress import Progress
 
@@ -223,6 +266,7 @@ def evaluate(command: Evaluate) -> int:
             command.episodes,
             video=command.video,
             workers=command.workers,
+            timeout=command.simulator_timeout,
             report=lambda done, score: bar.update(
                 job, completed=done, description=f"evaluating, return {score:.0f}"
             ),
@@ -257,7 +301,6 @@ def classify(command: Classify) -> int:
     """Tells the tasks of latent states."""
     from rich.progress import Progress
 
-    from dreamer_jax.files import write_json_atomically
     from experiments import classify
     from experiments.agents import load_source
 
@@ -288,6 +331,15 @@ def classify(command: Classify) -> int:
             )
     folder = command.source / "classification" if command.out is None else command.out
     folder.mkdir(parents=True, exist_ok=True)
+    with FolderLock(folder, ".classification.lock"):
+        _write_classification(command, outcome, folder, request)
+    return 0
+
+
+def _write_classification(command: Classify, outcome, folder: Path, request: dict) -> None:
+    from dreamer_jax.files import write_json_atomically
+    from experiments import classify
+
     print("Novel tasks: share taken for novel. Known: taken for not novel / for the right task.\n")
     print(classify.table(outcome) + "\n\n" + classify.distance_table(outcome) + "\n")
     settings = {"source": str(command.source), "features": command.features, **request}
@@ -296,4 +348,3 @@ def classify(command: Classify) -> int:
     )
     for path in (folder / "classification.json", *classify.plot(outcome, folder / "latents")):
         print(f"wrote {path}")
-    return 0

@@ -19,6 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.rollout import Records, collect
+from dreamer_jax.waiting import to_host
 from experiments.agents import Source, make_agent
 
 # Phases of training and of evaluations are numbered below; starts of these are new ones.
@@ -134,7 +135,7 @@ def gather(
                 ticks=source.spec.config.schedule.phase_ticks,
                 mode="random" if policy == "random" else "evaluate",
             )
-            records = Records(*(np.asarray(x)[0] for x in records))
+            records = Records(*(x[0] for x in to_host(records)))
             env.check()
             missing = agent.action_size - acting.action_size
             action = np.pad(records.action, ((0, 0), (0, 0), (0, missing)))

@@ -6,6 +6,7 @@ another machine and read there. A folder that cannot be read is warned of, and i
 missing.
 """
 
+import contextlib
 import re
 import warnings
 from collections.abc import Iterable
@@ -15,6 +16,7 @@ from pathlib import Path
 import envs
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
+from dreamer_jax.integrity import DamagedError, read_sealed_json
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
 from experiments.grid import SEEDS, THRESHOLDS, Backend, Cell, Table
@@ -127,6 +129,10 @@ def read_cells(folder: Path) -> tuple[str, ...]:
     names = read_json(folder / CELLS)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{folder / CELLS} is no list of names")
+    with contextlib.suppress(OSError, DamagedError):  # of which `read_spec` tells
+        header = read_sealed_json(folder / "run.json")
+        if isinstance(header, dict) and header.get("cells", names) != names:
+            raise ValueError(f"{folder / CELLS} names other cells than run.json: restore it")
     return tuple(names)
 
 

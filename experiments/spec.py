@@ -9,7 +9,7 @@ from typing import Any, Literal
 import envs
 from dreamer_jax import config as configs
 from dreamer_jax.config import Config
-from dreamer_jax.files import read_json
+from dreamer_jax.integrity import read_sealed_json
 from dreamer_jax.training import Member
 from transfer.recipes import fractional_transfer, meta_model
 
@@ -236,7 +236,7 @@ def read_spec(directory: str | Path) -> RunSpec:
             f"{directory} holds no run (there is no {path.name} in it); "
             "make one with: python -m experiments train --task ... --out " + str(directory)
         )
-    return RunSpec.from_dict(read_json(path)["spec"])
+    return RunSpec.from_dict(read_sealed_json(path)["spec"])
 
 
 def action_size(tasks: tuple[str, ...]) -> int:
