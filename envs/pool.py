@@ -34,9 +34,9 @@ SIMULATOR_TIMEOUT = 300.0
 """Seconds after which a simulator that does not answer is taken for stuck, unless told otherwise.
 """
 
-# Seconds after which that is warned of (and again after twice as many), and those that are left to
-# a simulator once whoever waits has asked not to wait.
-_PATIENCE, _HURRY = 10.0, 5.0
+# Seconds after which that is warned of (and again after twice as many), those that are left to a
+# simulator once whoever waits has asked not to wait, and those that a process has to start.
+_PATIENCE, _HURRY, _START = 10.0, 5.0, 120.0
 
 _BOOTSTRAP = (
     "import sys; sys.path[:] = sys.argv[4:]; "
@@ -137,7 +137,8 @@ class SimulatorPool:
                         WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
                     )
         try:
-            if failures := self._replies({index: [] for index in range(count)}):
+            starting = max(timeout, _START)
+            if failures := self._replies({index: [] for index in range(count)}, starting):
                 raise self._start_error(failures[0])
         except BaseException:
             self.close()
@@ -173,7 +174,8 @@ class SimulatorPool:
             # A process that is dead is noticed when its reply is waited for.
             with suppress(ConnectionError):
                 self._workers[index].connection.send((self._request_number, command, *share))
-        if failures := self._replies({index: share[0] for index, share in shares.items()}):
+        asked = {index: share[0] for index, share in shares.items()}
+        if failures := self._replies(asked, self._timeout):
             slot, problem = failures[0]
             raise SimulatorError(
                 f"The simulator of slot {slot}, {self.tasks[slot].name}, failed {problem}"
@@ -196,7 +198,7 @@ class SimulatorPool:
         for them wants to stop. May be called from another thread."""
         self._hurried = True
 
-    def _replies(self, asked: Mapping[int, list[int]]) -> list:
+    def _replies(self, asked: Mapping[int, list[int]], timeout: float) -> list:
         """Wait for replies; returns the failures that they report.
 
         All replies are read before an error is raised. Those to an earlier request, whose wait
@@ -204,6 +206,7 @@ class SimulatorPool:
 
         Args:
             asked: of each worker asked, the slots, in the order in which it does them.
+            timeout: seconds for which to wait.
         """
         pending = {self._workers[index].connection: index for index in asked}
         failures, error = [], None
@@ -231,7 +234,7 @@ class SimulatorPool:
             if self._hurried and seconds > _HURRY:
                 limit, why = _HURRY, " and the run is to stop"
             else:
-                limit, why = self._timeout, ""
+                limit, why = timeout, ""
             if seconds > limit:
                 for index in pending.values():
                     worker, slot = self._workers[index], self._busy_slot(index, asked[index])
@@ -243,7 +246,7 @@ class SimulatorPool:
                 warnings.warn(
                     f"the simulator of slot {slot}, {self.tasks[slot].name}, has not answered for "
                     f"{warned:.0f} seconds (process {self._workers[index].process.pid}); it is "
-                    f"given up after {self._timeout:.0f}",
+                    f"given up after {timeout:.0f}",
                     stacklevel=2,
                 )
                 warned *= 2
