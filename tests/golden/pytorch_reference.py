@@ -71,7 +71,7 @@ LEARNING = {
     "adam_epsilon": 1e-7,
 }
 CASES = {
-    # The thesis's losses; so small a state has less to tell, 0.25 to 0.4 nats, so the floor is lower.
+    # The thesis's losses. So small a state has 0.25 to 0.4 nats to tell: hence the low floor.
     "thesis": {"network": NETWORK, "learning": LEARNING},
     # What the thesis leaves out. The divergence is below its floor in the first update only; all
     # three gradients are clipped.
