@@ -537,8 +537,8 @@ def test_settings_that_are_not_the_presets_are_named(tmp_path):
         config = dataclasses.replace(preset("cpu"), schedule=schedule)
         write_folder(root, name, cells, lambda cell, task, count: [0.0] * count, config)
 
-    usual = preset("cpu").schedule.environment_steps
-    write("alone", [grid.baseline("bullet", "Ant", 0)], usual)
+    length = preset("cpu").schedule.environment_steps
+    write("alone", [grid.baseline("bullet", "Ant", 0)], length)
     assert publication.size_note(root) == "preset cpu: not comparable in size"
     # An agent for two tasks takes twice the environment steps.
     write("source", [grid.multitask("bullet", ("Hopper", "Ant"), 0)], 60_000)
