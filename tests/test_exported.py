@@ -9,11 +9,13 @@ import pytest
 
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
-from experiments import export as export_module
-from experiments import exported
-from experiments.agents import load_params, load_source
-from experiments.export import export
-from experiments.exported import Card, is_exported, read_card, read_params, weights_path
+from experiments.cli.main import main
+from experiments.runs import export as export_module
+from experiments.runs import exported
+from experiments.runs.agents import load_params, load_source
+from experiments.runs.export import export
+from experiments.runs.exported import Card, is_exported, read_card, read_params, weights_path
+from experiments.runs.start import load_sources
 from runs import spec_of, write_run
 from transfer_trees import bits
 
@@ -173,3 +175,35 @@ def test_a_verdict_compares_with_those_who_know_nothing():
     assert (
         card((50.0, 51.0), "bullet/hopper").verdict("bullet/hopper").endswith("above no action 44")
     )
+
+
+def test_an_agent_is_exported_and_trained_from_on_the_command_line(run, tmp_path, played, capsys):
+    file = tmp_path / "agent.safetensors"
+    assert main(["export", str(run), "--out", str(file), "--member", "1"]) == 0
+    assert f"{PENDULUM}: 20 ± 8 in 3 episodes" in capsys.readouterr().out
+    assert main(["export", str(run), "--out", str(file)]) == 2
+    assert "agent.safetensors is there already" in capsys.readouterr().err
+    spec = spec_of("inverted_pendulum", sources=(file,), omegas=(0.0, 0.5))
+    sources = load_sources(spec)
+    assert bits(sources.agents[0].params) == bits(load_source(run, 1).params)
+    words = ["train", "--preset", "cpu", "--task", PENDULUM, "--out", str(tmp_path / "target")]
+    assert main([*words, "--source", str(file), "--omega", "0"]) == 2
+    error = capsys.readouterr().err
+    assert "agent.safetensors has other networks (" in error
+
+
+def test_the_zoo_is_listed_and_told(run, tmp_path, played, capsys, monkeypatch):
+    monkeypatch.setattr(exported, "ZOO", tmp_path)
+    assert main(["zoo"]) == 0
+    assert "is empty" in capsys.readouterr().out
+    export(run, tmp_path / "pendulum.safetensors", note="for a test")
+    assert main(["zoo"]) == 0
+    output = capsys.readouterr().out
+    assert "pendulum: 80 environment steps" in output and "20 ± 8 in 3 episodes" in output
+    assert main(["zoo", "pendulum"]) == 0
+    output = capsys.readouterr().out
+    assert "episodes: 10, 20, 30" in output and "40 at 40, 80 at 80" in output
+    assert "for a test" in output and "--source zoo:pendulum" in output
+    assert main(["zoo", "nobody"]) == 2
+    assert "choose from pendulum" in capsys.readouterr().err
+    assert bits(load_source("zoo:pendulum").params) == bits(load_source(run).params)

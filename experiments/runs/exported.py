@@ -2,7 +2,7 @@
 
 An exported agent is two files of one name: its weights (.safetensors) and its card (.json), which
 says what the agent was trained on and how well it does. The zoo is a folder of them; "zoo:NAME" is
-the agent of that name there. `experiments.export` makes them.
+the agent of that name there. `experiments.runs.export` makes them.
 """
 
 import hashlib
@@ -19,9 +19,9 @@ import scipy.stats
 import envs
 import transfer
 from dreamer_jax.files import read_json
-from experiments.spec import RunSpec
+from experiments.runs.spec import RunSpec
 
-ZOO = Path(__file__).parent / "zoo"
+ZOO = Path(__file__).parent.parent / "zoo"
 """The folder of the agents that come with this package."""
 PREFIX = "zoo:"
 SUFFIX = ".safetensors"

@@ -1,4 +1,4 @@
-"""A member of a run -> an exported agent: weights and a card, see `experiments.exported`."""
+"""A member of a run -> an exported agent: weights and a card, see `experiments.runs.exported`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +12,10 @@ from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json, write_json_atomically
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.agents import load_params
-from experiments.evaluate import evaluate, load_agents
-from experiments.exported import FORMAT, SUFFIX, Card, file_sha256
-from experiments.spec import read_spec
+from experiments.runs.agents import load_params
+from experiments.runs.evaluate import evaluate, load_agents
+from experiments.runs.exported import FORMAT, SUFFIX, Card, file_sha256
+from experiments.runs.spec import read_spec
 
 
 def export(
