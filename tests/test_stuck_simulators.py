@@ -1,4 +1,4 @@
-"""Simulators that do not answer: warned of, given up after a while, and never waited for in vain."""
+"""Simulators that do not answer: warned of, given up, and never waited for in vain."""
 
 import os
 import signal
