@@ -139,7 +139,7 @@ class SimulatorPool:
         try:
             starting = max(timeout, _START)
             if failures := self._replies({index: [] for index in range(count)}, starting):
-                raise self._start_error(failures[0])
+                raise self._start_error(min(failures))
         except BaseException:
             self.close()
             raise
@@ -176,7 +176,7 @@ class SimulatorPool:
                 self._workers[index].connection.send((self._request_number, command, *share))
         asked = {index: share[0] for index, share in shares.items()}
         if failures := self._replies(asked, self._timeout):
-            slot, problem = failures[0]
+            slot, problem = min(failures)  # of the lowest slot, whoever was first
             raise SimulatorError(
                 f"The simulator of slot {slot}, {self.tasks[slot].name}, failed {problem}"
             )

@@ -16,6 +16,7 @@ from dreamer_jax import config as configs
 from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.integrity import DamagedError
+from dreamer_jax.ranges import check_ranges
 from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
@@ -48,6 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with usage_errors():
             command = _parse(arguments)
+            check_ranges(command)
         _keep_compiled_functions()
         keep_freed_memory()
         return dict(COMMANDS.values())[type(command)](command)

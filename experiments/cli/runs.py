@@ -11,6 +11,7 @@ import tyro
 
 from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
+from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, UsageError, usage_errors
 from experiments.thesis.grid import SEEDS, Backend
 
@@ -28,7 +29,7 @@ class Train:
     for any gymnasium environment with images, such as gymnasium/CartPole-v1."""
     out: Path
     """The results folder."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = setting((0,), 0, 2**31 - 1)
     """One agent per seed; all train as one population."""
     preset: Literal["thesis", "cpu", "demo", "debug"] = "cpu"
     """Settings to start from; each can be overridden by its name below."""
@@ -36,9 +37,9 @@ class Train:
     """The agent to transfer from: a results folder, a .safetensors file that `export` wrote, or
     zoo:NAME (`zoo` lists them). Fractional transfer takes several: each has targets of its own in
     the population."""
-    source_member: int = 0
+    source_member: int = setting(0, 0, 10**6)
     """Which member of each source's population."""
-    omega: tuple[float, ...] = ()
+    omega: tuple[float, ...] = setting((), 0, 1, why="must lie in [0, 1] (equation 19)")
     """Fractions of the source's last reward and value layers to add (0 to 1)."""
     baseline: bool = False
     """Add agents from scratch, one per seed, to the transfer targets."""
@@ -54,16 +55,16 @@ class Train:
     reward_sources: tuple[Path, ...] = ()
     """meta: results folders of agents made by --method uae from the same source, whose models the
     meta-model reads."""
-    reward_counts: tuple[int, ...] = ()
+    reward_counts: tuple[int, ...] = setting((), 1, 1000)
     """meta: how many of these a target reads, the first ones; one target per number and seed."""
     meta: tuple[str, ...] = ("reward",)
     """meta: the components that are meta-models (any of reward, value, dynamics)."""
-    meta_layers: int = 1
+    meta_layers: int = setting(1, 0, 100)
     """meta: hidden layers of a meta-model of reward or value."""
     switching: bool = False
     """meta: recognise the task of each latent state, and use the stored reward model of a task
     that is known and the meta-model for a novel one (needs --dynamics frozen)."""
-    threshold: float | None = None
+    threshold: float | None = setting(None, 0, 1e9, above=True)
     """meta, switching: the distance beyond which a task is novel; by default suggested by the
     samples of the known tasks."""
     resume: bool = False
@@ -71,9 +72,9 @@ class Train:
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
-    simulator_timeout: float = 300.0
+    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
     and ended."""
     config: tyro.conf.OmitArgPrefixes[Config] = Config()
@@ -85,13 +86,13 @@ class Evaluate:
 
     directory: tyro.conf.Positional[Path]
     """The results folder."""
-    episodes: int = 5
+    episodes: int = setting(5, 1, 10**6)
     """Episodes per agent and task."""
     video: bool = False
     """Write videos of an episode and of an open-loop prediction into the folder."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
-    simulator_timeout: float = 300.0
+    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck."""
 
 
@@ -111,16 +112,16 @@ class Classify:
     """Those of the tasks that the classifier is fitted on; the others are novel."""
     out: Path | None = None
     """Folder for the table and the picture; by default classification/ in the source's."""
-    source_member: int = 0
+    source_member: int = setting(0, 0, 10**6)
     """Which member of the source's population."""
-    samples: int = 100
+    samples: int = setting(100, 1, 10**6)
     """Latent states of each task to fit on, and as many, of other episodes, to test."""
-    thresholds: tuple[float, ...] = ()
+    thresholds: tuple[float, ...] = setting((), 0, 1e9, above=True)
     """Distances beyond which a state is novel; by default 50, 70 and 90 for 230 features, scaled
     to the agent's. One suggested by the fitted samples is always added."""
-    quantile: float = 0.95
+    quantile: float = setting(0.95, 0, 1)
     """Share of known samples that the suggested threshold should hold."""
-    neighbours: int = 5
+    neighbours: int = setting(5, 1, 10**6)
     """Nearest samples that vote for the task."""
     policy: Literal["random", "trained"] = "random"
     """Who plays: random actions, or a trained agent (the mode, without noise)."""
@@ -130,9 +131,9 @@ class Classify:
     features: Literal["sample", "mean", "first"] = "sample"
     """The latent state: a sample of the posterior along an episode (what agents act on), its mean,
     or each image as if it were the first of an episode."""
-    seed: int = 0
+    seed: int = setting(0, 0, 2**31 - 1)
     """Of episodes, actions and samples."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
 
 
@@ -148,7 +149,7 @@ class Report:
     """The results folder, or several."""
     out: Path = Path("comparison.png")
     """Of several folders: the picture to draw; an .svg is written beside it."""
-    seeds: tuple[int, ...] = SEEDS
+    seeds: tuple[int, ...] = setting(SEEDS, 0, 2**31 - 1)
     """Of all results: the seeds that tables and figures show."""
     backend: Backend = "bullet"
     """Of all results: the simulators."""
@@ -256,8 +257,6 @@ def _evaluate(command: Evaluate) -> int:
     from experiments.runs.evaluate import evaluate, load_agents
     from experiments.runs.text import aligned
 
-    if command.episodes < 1:
-        raise UsageError(f"--episodes is {command.episodes}, must be at least 1")
     with usage_errors():
         agents = load_agents(command.directory)
     with Progress() as bar:

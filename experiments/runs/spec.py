@@ -10,6 +10,7 @@ import envs
 from dreamer_jax import config as configs
 from dreamer_jax.config import Config
 from dreamer_jax.integrity import read_sealed_json
+from dreamer_jax.ranges import check_ranges, setting
 from dreamer_jax.training import Member
 from transfer.recipes import fractional_transfer, meta_model
 
@@ -51,7 +52,7 @@ class RunSpec:
     seeds: tuple[int, ...]
     config: Config
     sources: tuple[str, ...] = ()
-    source_member: int = 0
+    source_member: int = setting(0, 0, 10**6)
     omegas: tuple[float, ...] = ()
     baseline: bool = False
     method: Method = "fractional"
@@ -60,9 +61,9 @@ class RunSpec:
     reward_sources: tuple[str, ...] = ()
     reward_counts: tuple[int, ...] = ()
     meta: tuple[str, ...] = ("reward",)
-    meta_layers: int = 1
+    meta_layers: int = setting(1, 0, 100)
     switching: bool = False
-    threshold: float | None = None
+    threshold: float | None = setting(None, 0, 1e9, above=True)
 
     def __post_init__(self):
         choices = ", ".join([*envs.task_names(), "gymnasium/ID"])
@@ -75,6 +76,8 @@ class RunSpec:
             all(0 <= seed < 2**31 for seed in self.seeds),
             f"seeds {self.seeds} must lie in [0, 2^31)",
         )
+        configs.check_prefill(self.config, len(self.tasks))
+        check_ranges(self)
         _require(
             len(set(self.sources)) == len(self.sources), f"a source is named twice: {self.sources}"
         )
@@ -140,7 +143,6 @@ class RunSpec:
             len(set(self.reward_counts)) == len(self.reward_counts),
             f"a number of reward sources is named twice: {self.reward_counts}",
         )
-        _require(self.meta_layers >= 0, f"meta_layers is {self.meta_layers}, must not be negative")
         _require(
             self.threshold is None or self.switching,
             "--threshold is that of --switching: add it, or leave both out",
