@@ -4,7 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from experiments.methods.base import Cell, Held, Knowledge, Method, require, setting
+from experiments.methods.base import (
+    SOURCE_HELP,
+    Cell,
+    Held,
+    Knowledge,
+    Method,
+    require,
+    setting,
+)
 
 
 @dataclass(frozen=True)
@@ -17,8 +25,7 @@ class UniversalAutoencoder(Method):
     sources: tuple[str, ...] = setting(
         (),
         "source",
-        "Results folder of the agent to transfer from. Several, but for uae and meta: each has "
-        "targets of its own in the population.",
+        SOURCE_HELP,
         folder=True,
     )
     source_member: int = setting(0, "source-member", "Which member of each source's population.")

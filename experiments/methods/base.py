@@ -26,6 +26,13 @@ BASELINE = "baseline"
 """The label of agents from scratch."""
 
 
+SOURCE_HELP = (
+    "The agent to transfer from: a results folder, a .safetensors file that `export` wrote, or "
+    "zoo:NAME (`zoo` lists them). Several, but for uae and meta: each has targets of its own in "
+    "the population."
+)
+
+
 def setting(default: Any, option: str, help: str, *, folder: bool = False) -> Any:
     """A field of a method that is also an option of the command line.
 

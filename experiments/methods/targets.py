@@ -5,7 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.methods.base import Cell, Held, Knowledge, Method, Sources, require, setting
+from experiments.methods.base import (
+    SOURCE_HELP,
+    Cell,
+    Held,
+    Knowledge,
+    Method,
+    Sources,
+    require,
+    setting,
+)
 
 
 @dataclass(frozen=True)
@@ -15,8 +24,7 @@ class Targets(Method):
     sources: tuple[str, ...] = setting(
         (),
         "source",
-        "Results folder of the agent to transfer from. Several, but for uae and meta: each has "
-        "targets of its own in the population.",
+        SOURCE_HELP,
         folder=True,
     )
     source_member: int = setting(0, "source-member", "Which member of each source's population.")

@@ -28,8 +28,8 @@ def load_sources(spec: RunSpec, base: str | Path = "") -> Sources:
         source.
     """
     method = spec.method
-    agents = tuple(load_source(Path(base) / path, method.source_member) for path in method.sources)
-    stored = tuple(load_source(Path(base) / path) for path in method.stored)
+    agents = tuple(load_source(path, method.source_member, base) for path in method.sources)
+    stored = tuple(load_source(path, base=base) for path in method.stored)
     for one in (*agents, *stored):
         check_source(one, spec)
     sources = Sources(agents, stored)
