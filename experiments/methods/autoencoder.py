@@ -20,7 +20,7 @@ class UniversalAutoencoder(Method):
     """Targets with a source's frozen encoder, one per seed."""
 
     NAME: ClassVar[str] = "uae"
-    SUMMARY: ClassVar[str] = "on a source's frozen encoder and its decoder"
+    SUMMARY: ClassVar[str] = "on a source's frozen encoder, and its decoder"
 
     sources: tuple[str, ...] = setting(
         (),

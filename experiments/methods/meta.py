@@ -21,7 +21,9 @@ class MetaModel(UniversalAutoencoder):
     """Targets whose models read what stored models predict, one per number of these and seed."""
 
     NAME: ClassVar[str] = "meta"
-    SUMMARY: ClassVar[str] = "that and with meta-models over the models of further agents"
+    SUMMARY: ClassVar[str] = (
+        "on a source's frozen encoder, with meta-models over further agents' models"
+    )
 
     reward_sources: tuple[str, ...] = setting(
         (),

@@ -11,6 +11,7 @@ from dreamer_jax import config as configs
 from dreamer_jax.config import Config, Difference
 from dreamer_jax.files import read_json
 from experiments import methods
+from experiments.methods.base import BASELINE as BASELINE
 from experiments.methods.base import Method, require
 from experiments.methods.scratch import Scratch
 

@@ -3,6 +3,7 @@
 Axis letters: P population member.
 """
 
+import functools
 from pathlib import Path
 
 import jax
@@ -11,8 +12,8 @@ import jax.numpy as jnp
 import transfer
 from dreamer_jax.agent import AgentState
 from experiments.methods import Sources
-from experiments.runs.agents import Source, check_source, load_source, make_agent
-from experiments.runs.latents import Latents, gather, phases_for
+from experiments.runs.agents import check_source, load_source, make_agent
+from experiments.runs.latents import own_latents
 from experiments.runs.spec import RunSpec
 
 
@@ -54,12 +55,8 @@ def transferred_members(
     Raises:
       ValueError: the sources do not fit what the method reads.
     """
-
-    def sample(source: Source, samples: int) -> list[Latents]:
-        phases = phases_for(source, samples)
-        return gather(source, source.spec.tasks, phases, workers=workers)
-
     agent, method = make_agent(spec), spec.method
+    sample = functools.partial(own_latents, workers=workers)
     given = method.knowledge(agent, spec.seeds, sources, sample)
     # Members from scratch come last.
     count = len(method.targets(spec.seeds))

@@ -20,6 +20,7 @@ from experiments.thesis.populations import (
     new_populations,
     of_length,
 )
+from experiments.thesis.populations import task_name as task_name
 
 # How members are mapped depends on the machine and changes no result but by rounding.
 _OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
