@@ -59,7 +59,8 @@ def source_leaves(
     Raises:
         ValueError: as :func:`transfer.claims`, or a leaf the plan reads that the source has not.
     """
-    flat, names = flatten(source), {}
+    flat = flatten(source)
+    names: dict[str, None] = {}
     for path, rule in claims(plan, target).items():
         if "source" in _signature(rule, operations):
             names |= dict.fromkeys(source_places(rule, path, flat))
@@ -226,11 +227,12 @@ def _prepare(
     members = populations.size(target) if population else None
     if key is not None:
         key = check_key(key)
-        if population and key.ndim == key_ndim(key):
+        if members is not None and key.ndim == key_ndim(key):
             key = jax.random.split(key, members)
     sources = flat_sources(plan, source)
     rules = tuple({id(rule): rule for rule in claimed.values()}.values())
-    work, arguments, read = [], [], {name: set() for name in sources}
+    work, arguments = [], []
+    read: dict[str | None, set[str]] = {name: set() for name in sources}
     for rule in rules:
         mine = tuple(path for path in before if claimed[path] is rule)
         signature = _signature(rule, operations)
@@ -391,12 +393,13 @@ def _plain(value: Any) -> Any:
 
 def _gradient(rule: Rule, name: str, value: Mapping, mine: Sequence[str]) -> dict[str, Any]:
     """The number of each leaf where ``values`` are spread over a captured part."""
-    depths = {path: rule.captured(path).get(value["over"]) for path in mine}
-    if None in depths.values():
+    captured = {path: rule.captured(path) for path in mine}
+    if any(value["over"] not in parts for parts in captured.values()):
         raise ValueError(
             f"{name} of the rule '{rule}' is spread over {{{value['over']}}}, which its pattern "
             "does not capture."
         )
+    depths = {path: parts[value["over"]] for path, parts in captured.items()}
     order = sorted(set(depths.values()), key=natural)
     values = value["values"]
     knots = [jnp.asarray(knot, jnp.float32) for knot in values] if np.ndim(values) else []

@@ -106,10 +106,12 @@ def check_size(file: ArrayFile, names: Iterable[str]) -> None:
 
 def _bytes(count: int) -> str:
     """A number of bytes for people."""
-    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
-        if count < 1024 or unit == "TiB":
-            return f"{count:.4g} {unit}"
-        count /= 1024
+    amount = float(count)
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if amount < 1024:
+            return f"{amount:.4g} {unit}"
+        amount /= 1024
+    return f"{amount:.4g} TiB"
 
 
 @contextmanager

@@ -208,7 +208,8 @@ class _OrbaxFolder(ArrayFile):
             restored = checkpointer.restore(
                 self._path.absolute(),
                 args=ocp.args.PyTreeRestore(
-                    item=structure.unflatten(wanted), restore_args=structure.unflatten(kind)
+                    item=jax.tree.unflatten(structure, wanted),
+                    restore_args=jax.tree.unflatten(structure, kind),
                 ),
             )
             leaves = jax.tree.leaves(restored)

@@ -87,7 +87,7 @@ def from_mergekit(data: Any, *, layers: str = "layers") -> Plan:
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"expected a mapping, got {data!r}")
-    method = data.get("merge_method")
+    method: Any = data.get("merge_method")
     if method not in _METHODS:
         raise ValueError(f"the method {method!r} is not read; those are {', '.join(_METHODS)}")
     known = ("merge_method", "base_model", "models", "slices", "parameters", *_IGNORED)
@@ -107,24 +107,24 @@ def from_mergekit(data: Any, *, layers: str = "layers") -> Plan:
     source = tuple(f"{name}:" for name in models)
     groups = _groups(operation, shared, models)
     gradient = any(_is_gradient(value) for group in groups for value in _all(group[1]))
-    rules, earlier = [], []
+    rules: list[Rule] = []
+    earlier: list[str] = []
     for filter_, values in groups:
         holds = [] if filter_ is None else [f"*{part}*" for part in filter_.split(".")]
         middle = "/".join(["**", *holds, "**"]) if holds else "**"
         without = tuple(f"!{pattern}" for pattern in earlier)
         inside = f"**/{layers}/{{layer}}/{middle}"
-        regions = [(("**" if not holds else middle), None, False)]
+        regions: list[tuple[tuple[str, ...], Any, bool]] = [((middle,), None, False)]
         if gradient:
             outside = f"!**/{layers}/*/**"
             first = "**/*embed*/**"
             regions = [
                 ((inside,), "layer", False),
                 ((middle, outside, f"!{first}"), 1.0, True),
-                ((first, outside), 0.0, True) if not holds else None,
             ]
-        for region in filter(None, regions):
-            patterns, place, optional = region
-            patterns = (patterns,) if isinstance(patterns, str) else patterns
+            if not holds:
+                regions.append(((first, outside), 0.0, True))
+        for patterns, place, optional in regions:
             rules.append(
                 Rule(
                     (*patterns, *without),

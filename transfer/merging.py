@@ -83,7 +83,8 @@ def merge_leaves(
         # [P, N, ...] for a population, so that members are mapped and sources follow.
         axis = 1 if population else 0
         models = jnp.stack([wide(path, other) for other in others], axis=axis)
-        arguments, axes = [base, models], [0, 0]
+        arguments = [base, models]
+        axes: list[int | None] = [0, 0]
         if key is not None:
             arguments.append(
                 draw(jax.random.uniform, path, key, models.shape, jnp.float32, population)

@@ -48,31 +48,27 @@ def captures(pattern: str, path: str) -> dict[str, str] | None:
     at = position = 0
     # Where to go on after a mismatch: the last "**" takes one part more. One such place is enough,
     # as for the "*" of a file name, so no pattern takes more than parts x parts comparisons.
-    retry: tuple[int, int, int, dict[str, str]] | None = None
+    retry: tuple[int, str | None, int, int, dict[str, str]] | None = None
     while True:
-        if at < len(wanted) and isinstance(wanted[at], _Several):
-            retry = (at, position, position, dict(found))
-            found = _with(found, wanted[at].name, "")
-        elif at < len(wanted) and position < len(parts):
-            hit = wanted[at].fullmatch(parts[position])
+        part = wanted[at] if at < len(wanted) else None
+        if isinstance(part, _Several):
+            retry = (at, part.name, position, position, dict(found))
+            found, at = _with(found, part.name, ""), at + 1
+            continue
+        if part is None and position == len(parts):
+            return found
+        if part is not None and position < len(parts):
+            hit = part.fullmatch(parts[position])
             named = found if hit is None else _merged(found, hit.groupdict())
             if hit is not None and named is not None:
                 found, at, position = named, at + 1, position + 1
                 continue
-            found = None
-        else:
-            found = found if at == len(wanted) and position == len(parts) else None
-            if found is not None:
-                return found
-        if found is not None:
-            at += 1
-            continue
-        if retry is None or retry[2] >= len(parts):
+        if retry is None or retry[3] >= len(parts):
             return None
-        at, start, end, before = retry
-        retry = (at, start, end + 1, before)
+        at, name, start, end, before = retry
+        retry = (at, name, start, end + 1, before)
         position = end + 1
-        found = _with(before, wanted[at].name, "/".join(parts[start:position]))
+        found = _with(before, name, "/".join(parts[start:position]))
         at += 1
 
 
@@ -106,12 +102,12 @@ def _part(part: str) -> "re.Pattern[str] | _Several":
         return _Several(_checked_name(part, named[1].removesuffix(":**")))
     # Text and wildcards in turn. Each wildcard with the text behind it is an atomic group: the
     # first place where the text fits is as good as any later one.
-    pieces: list[tuple[str | None, str]] = [(None, "")]
+    pieces: list[tuple[str, str]] = [("", "")]
     seen: set[str] = set()
     index = 0
     while index < len(part):
         character, rest = part[index], part[index:]
-        wildcard, text, length = None, re.escape(character), 1
+        wildcard, text, length = "", re.escape(character), 1
         if character == "\\" and len(rest) > 1:
             text, length = re.escape(rest[1]), 2
         elif character == "*":
@@ -124,12 +120,12 @@ def _part(part: str) -> "re.Pattern[str] | _Several":
             text, length = f"[{inside}]", end + 1
         elif character == "{" and (named := _NAMED.match(rest)):
             name, length = _checked_name(part, named[1]), named.end()
-            wildcard, text = (f"(?P<{name}>.+)", "") if name not in seen else (None, f"(?P={name})")
+            wildcard, text = (f"(?P<{name}>.+)", "") if name not in seen else ("", f"(?P={name})")
             seen.add(name)
-        if wildcard is None:
-            pieces[-1] = (pieces[-1][0], pieces[-1][1] + text)
-        else:
+        if wildcard:
             pieces.append((wildcard, ""))
+        else:
+            pieces[-1] = (pieces[-1][0], pieces[-1][1] + text)
         index += length
     expression = pieces[0][1]
     for number, (wildcard, text) in enumerate(pieces[1:], start=2):

@@ -9,7 +9,7 @@ or JSON and back (see :mod:`transfer.plan_files`). :func:`transfer.apply` carrie
 import dataclasses
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ class Parameters(Mapping[str, Any]):
     """A mapping that cannot be changed, with a hash."""
 
     __slots__ = ("_items",)
+    _items: Mapping[str, Any]
 
     def __init__(self, items: Mapping[str, Any]):
         object.__setattr__(self, "_items", dict(items))
@@ -155,8 +156,24 @@ class Rule:
     note: str = ""
     layout: tuple[Any, ...] = ()
 
+    if TYPE_CHECKING:
+        # What may be given, where the fields say what there is.
+        def __init__(
+            self,
+            patterns: str | Sequence[str],
+            operation: str,
+            parameters: Mapping[str, Any] = ...,
+            source: str | Sequence[str] | None = None,
+            optional: bool = False,
+            frozen: bool = False,
+            note: str = "",
+            layout: str | Mapping[str, Any] | Sequence[Any] = (),
+        ) -> None: ...
+
     def __post_init__(self):
-        patterns = (self.patterns,) if isinstance(self.patterns, str) else self.patterns
+        patterns: Any = self.patterns
+        if isinstance(patterns, str):
+            patterns = (patterns,)
         if (
             not isinstance(patterns, Sequence)
             or not patterns
@@ -175,11 +192,15 @@ class Rule:
             ("note", str, "text"),
         ):
             _check_type(what, name, getattr(self, name), kind, word)
-        source = tuple(self.source) if isinstance(self.source, list) else self.source
+        source: Any = self.source
+        if isinstance(source, list):
+            source = tuple(source)
         for text in source if isinstance(source, tuple) else (source,):
             if text is not None or source == ():
                 _check_type(what, "source", text, str, "a name, or several")
-        layout = (self.layout,) if isinstance(self.layout, str | Mapping) else self.layout
+        layout: Any = self.layout
+        if isinstance(layout, str | Mapping):
+            layout = (layout,)
         layouts.steps(layout)
         object.__setattr__(self, "patterns", tuple(patterns))
         object.__setattr__(self, "source", source)
@@ -236,7 +257,7 @@ def is_gradient(value: Any) -> bool:
     return isinstance(value, Mapping) and set(value) == {"values", "over"}
 
 
-def _check_type(what: str, name: str, value: Any, kind: type, word: str) -> None:
+def _check_type(what: str, name: str, value: Any, kind: Any, word: str) -> None:
     if not isinstance(value, kind):
         raise ValueError(
             f"{name} of {what} is {value!r} ({type(value).__name__}); expected {word}."
@@ -313,8 +334,9 @@ def claims(plan: Plan, target: PyTree) -> dict[str, Rule]:
             f"No rule claims {len(left)} of {len(names)} leaves: {', '.join(left)}. Add a rule, or "
             "set the plan's default."
         )
-    rest = Rule("**", plan.default) if left else None
-    return {path: claimed.get(path, rest) for path in names}
+    if left and plan.default is not None:
+        claimed |= dict.fromkeys(left, Rule("**", plan.default))
+    return {path: claimed[path] for path in names}
 
 
 def frozen(plan: Plan, tree: PyTree) -> Mask:

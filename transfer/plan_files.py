@@ -131,7 +131,7 @@ def read_data(path: str | os.PathLike) -> Any:
             raise ValueError(f"{path} holds no plan: {error}") from error
     yaml = _yaml()
 
-    class Loader(yaml.SafeLoader):
+    class Loader(yaml.SafeLoader):  # type: ignore[name-defined]
         def construct_mapping(self, node, deep=False):
             keys = [self.construct_object(key, deep=True) for key, _ in node.value]
             _without_repetition([(str(key), None) for key in keys])

@@ -162,7 +162,7 @@ def draw(plan: Plan, target: PyTree, *, axes: Any = None, components: Sequence[s
     if axes is None:
         height = 1 + 0.55 * max(map(len, columns.values()))
         _, axes = plt.subplots(figsize=(1.9 * len(columns), height), layout="constrained")
-    seen = {}
+    seen: dict[str, str] = {}
     for column, (component, layers) in enumerate(columns.items()):
         axes.text(column, 0.9, component, ha="center", va="bottom", weight="bold")
         for row, (layer, descriptions) in enumerate(layers):

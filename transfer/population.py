@@ -64,9 +64,10 @@ def size(population: PyTree) -> int:
     Raises:
         ValueError: there are no leaves, or their leading axes differ.
     """
-    sizes = {
+    sizes: dict[str, int | None] = {
         path: leaf.shape[0] if leaf.shape else None for path, leaf in flatten(population).items()
     }
-    if len(set(sizes.values())) != 1 or None in sizes.values():
+    found = next(iter(sizes.values()), None)
+    if found is None or len(set(sizes.values())) != 1:
         raise ValueError(f"The leaves of a population must share a leading axis, got {sizes}.")
-    return next(iter(sizes.values()))
+    return found

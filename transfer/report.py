@@ -131,11 +131,11 @@ class Report:
         if self.members is not None:
             footer += f"; numbers are means over {self.members} members"
         rule = "-" * max(map(len, aligned))
-        lines = [aligned[0], rule, *aligned[1:], rule, footer]
+        table = [aligned[0], rule, *aligned[1:], rule, footer]
         if self.unread:
             more = f", ... ({len(self.unread)} in all)" if len(self.unread) > 8 else ""
-            lines.append(f"not read of the source: {', '.join(self.unread[:8])}{more}")
-        return "\n".join(lines)
+            table.append(f"not read of the source: {', '.join(self.unread[:8])}{more}")
+        return "\n".join(table)
 
     def _line(self, record: dict[str, Any]) -> tuple[str, ...]:
         arguments = ", ".join(

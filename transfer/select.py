@@ -142,16 +142,17 @@ def _rebuild(tree: PyTree, leaves: Sequence[Any]) -> PyTree:
     """The tree with other JAX leaves. What it holds twice, it holds twice again."""
     boxes, outer = jax.tree.flatten(tree, is_leaf=_is_nnx_variable)
     if not any(map(_is_nnx_variable, boxes)):
-        return outer.unflatten(leaves)
-    remaining, filled, made = iter(leaves), [], {}
+        return jax.tree.unflatten(outer, leaves)
+    remaining, filled = iter(leaves), []
+    made: dict[int, Any] = {}
     for box in boxes:
         if not _is_nnx_variable(box):
             filled.append(next(remaining))
             continue
-        inner = jax.tree.structure(box)
-        new = inner.unflatten([next(remaining) for _ in range(inner.num_leaves)])
+        held, inner = jax.tree.flatten(box)
+        new = jax.tree.unflatten(inner, [next(remaining) for _ in held])
         filled.append(made.setdefault(id(box), new))
-    return outer.unflatten(filled)
+    return jax.tree.unflatten(outer, filled)
 
 
 def paths(tree: PyTree) -> tuple[str, ...]:
@@ -259,14 +260,16 @@ def join(choose: Callable[..., Any], parts: Sequence[PyTree]) -> PyTree:
         # What every part holds twice stays one thing.
         key = tuple(map(id, together))
         boxes.append(made.setdefault(key, whole) if _is_nnx_variable(together[0]) else whole)
-    return flat[0][1].unflatten(boxes)
+    return jax.tree.unflatten(flat[0][1], boxes)
 
 
 def same_structure(name: str, tree: PyTree, other_name: str, other: PyTree) -> None:
-    if jax.tree.structure(tree) != jax.tree.structure(other):
+    # JAX's hints do not say that structures compare.
+    got: Any = jax.tree.structure(tree)
+    expected: Any = jax.tree.structure(other)
+    if got != expected:
         raise ValueError(
-            f"The structure of {name} is not that of {other_name}: got "
-            f"{jax.tree.structure(tree)}, expected {jax.tree.structure(other)}."
+            f"The structure of {name} is not that of {other_name}: got {got}, expected {expected}."
         )
 
 
