@@ -41,9 +41,8 @@ class FolderLock:
     A context manager too. A second lock of the same name in one process is refused like any other.
 
     Args:
-        directory: the folder.
+        directory: the folder; made if absent.
         name: of the lock's file. Work that does not disturb other work has a lock of its own.
-        make: whether to make the folder if it is absent.
 
     Raises:
         FolderInUseError: another process (named, with its host and since when) holds it.
@@ -51,12 +50,11 @@ class FolderLock:
         OSError: the folder cannot be written.
     """
 
-    def __init__(self, directory: str | os.PathLike, name: str = ".lock", make: bool = True):
+    def __init__(self, directory: str | os.PathLike, name: str = ".lock"):
         directory = Path(directory)
         self.path = directory / name
         try:
-            if make:
-                directory.mkdir(parents=True, exist_ok=True)
+            directory.mkdir(parents=True, exist_ok=True)
             self._file = open(self.path, "a+")
         except (FileExistsError, NotADirectoryError):
             raise NotADirectoryError(

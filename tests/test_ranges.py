@@ -45,7 +45,7 @@ def test_every_number_of_a_configuration_refuses_what_is_not_in_its_range(group)
             assert str(allowed[name]) in str(raised.value)
 
 
-@pytest.mark.parametrize("command", [options for options, _ in COMMANDS.values()])
+@pytest.mark.parametrize("command", [command.options() for command in COMMANDS.values()])
 def test_every_number_of_a_command_has_a_range(command):
     declared = {entry.name for entry in dataclasses.fields(command) if "range" in entry.metadata}
     assert set(numbers_of(command)) - {"from_checkpoint"} == declared

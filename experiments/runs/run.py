@@ -94,7 +94,7 @@ def make_run(
     env = None
     try:
         state, report = None, None
-        if spec.sources and Checkpointer(directory / "checkpoints").latest() is None:
+        if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
             state, report = transferred_members(spec, load_sources(spec, base), workers=workers)
         agent = make_agent(spec)
         env = make_env(spec, workers=workers, timeout=timeout)
@@ -104,9 +104,8 @@ def make_run(
             write_report(report, directory)
         # Written last: what has a header can be resumed.
         if not (directory / "run.json").exists():
-            made_with = {"versions": _versions(), "revision": _revision()}
-            # What has no cells is no run of the grid.
             named = {"cells": list(cells)} if cells else {}
+            made_with = {"versions": _versions(), "revision": _revision()}
             content = {"spec": spec.to_dict(), **named, **made_with}
             write_sealed_json(directory / "run.json", content)
         return Run(
@@ -133,10 +132,8 @@ def _check_folder(directory: Path, spec: RunSpec, resume: bool) -> None:
     if directory.exists() and not directory.is_dir():
         raise NotADirectoryError(f"{directory} is a file: name a folder for the results")
     if not (directory / "run.json").exists():
-        held = [
-            name for name in ("metrics.jsonl", "replay", "checkpoints") if _holds(directory, name)
-        ]
-        if held:
+        names = ("metrics.jsonl", "replay", "checkpoints")
+        if held := [name for name in names if _holds(directory, name)]:
             raise DamagedError(
                 f"{directory} holds {' and '.join(held)} of a run, but no run.json to say which: "
                 "restore it, or choose another folder (or move this one away) to start again"
@@ -145,7 +142,7 @@ def _check_folder(directory: Path, spec: RunSpec, resume: bool) -> None:
     different = read_spec(directory).differences(spec)
     if different:
         raise ValueError(
-            f"{directory} holds another run (there / here: {'; '.join(different)}): "
+            f"{directory} holds another run (there / here: {'; '.join(map(str, different))}): "
             "give the same settings, or choose another folder"
         )
     if not resume:
@@ -158,9 +155,8 @@ def _holds(directory: Path, name: str) -> bool:
     """Whether something of a run is kept under that name."""
     path = directory / name
     if path.is_dir():
-        return any(file.stat().st_size for file in path.glob("member_*/*") if file.is_file()) or (
-            Checkpointer(path).latest() is not None
-        )
+        records = any(file.stat().st_size for file in path.glob("member_*/*"))
+        return records or Checkpointer(path).latest() is not None
     return path.exists() and path.stat().st_size > 0
 
 
