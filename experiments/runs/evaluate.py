@@ -16,6 +16,7 @@ import envs
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.rollout import Episode, Records, collect, episodes
 from dreamer_jax.video import tile, write_video
+from dreamer_jax.waiting import to_host
 from experiments.runs.agents import load_params, make_agent, make_env
 from experiments.runs.spec import RunSpec, read_spec
 
