@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import tyro
 
+from dreamer_jax.output import safe_output
 from dreamer_jax.ranges import check_ranges
 from experiments.cli import runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
@@ -71,6 +72,11 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _keep_compiled_functions()
+    with safe_output():
+        return _main(arguments, program)
+
+
+def _main(arguments: list[str], program: str) -> int:
     try:
         with usage_errors():
             command, options = _parse(arguments, program)
@@ -108,7 +114,10 @@ def _keep_compiled_functions() -> None:
 
     JAX reads this as it is imported; its own setting takes precedence.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # neither HOME nor an entry in the list of users
+        return
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache / "dreamer-transfer" / "jax"))
 
 
