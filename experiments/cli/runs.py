@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+import envs
 from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.ranges import setting
@@ -59,6 +60,8 @@ class Run:
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
     and ended."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,8 @@ class Evaluate:
     """Simulator processes; by default one per core."""
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +177,8 @@ class Classify:
     """Of episodes, actions and samples."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +210,7 @@ class Verify:
 def train(command: Train) -> int:
     """Trains a population."""
     from experiments.runs.spec import RunSpec
+    from experiments.runs.trust import check_trust, is_of_another
 
     run = command.run
     if run.from_checkpoint == "list":
@@ -214,6 +222,10 @@ def train(command: Train) -> int:
     with usage_errors():
         method = make_method(command.method, command.transfer)
         spec = RunSpec(run.task, run.seeds, command.config, method)
+        envs.specs(spec.tasks)
+        check_trust([*method.sources, *method.stored], run.trust)
+        if is_of_another(run.out):
+            check_trust([run.out], run.trust)
     from experiments.runs.run import carry_out, make_run
 
     with usage_errors():
@@ -272,9 +284,9 @@ def verify(command: Verify) -> int:
 def evaluate(command: Evaluate) -> int:
     """Plays episodes and prints their returns."""
     with usage_errors():
-        from experiments.runs.spec import read_spec
+        from experiments.runs.trust import check_trust
 
-        read_spec(command.directory)
+        check_trust([command.directory], command.trust)
         lock = FolderLock(command.directory, ".evaluation.lock")
     with lock:
         return _evaluate(command)
@@ -334,6 +346,7 @@ def classify(command: Classify) -> int:
 
     from experiments.runs import classify
     from experiments.runs.agents import load_source
+    from experiments.runs.trust import check_trust
 
     request = {
         "samples": command.samples,
@@ -343,6 +356,7 @@ def classify(command: Classify) -> int:
     }
     with usage_errors():
         classify.check_request(command.task, command.known, actors=command.actors, **request)
+        check_trust([command.source, *command.actors], command.trust)
         source = load_source(command.source, command.source_member)
         actors = [load_source(directory) for directory in command.actors]
         with Progress() as bar:

@@ -31,6 +31,8 @@ class Export:
     """A sentence for the card."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,10 @@ def export(command: Export) -> int:
     from rich.progress import Progress
 
     from experiments.runs.export import export
+    from experiments.runs.trust import check_trust
 
+    with usage_errors():
+        check_trust([command.directory], command.trust)
     with usage_errors(), Progress() as bar:
         job = bar.add_task("playing", total=command.episodes)
         card = export(

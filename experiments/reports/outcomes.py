@@ -10,9 +10,8 @@ from pathlib import Path
 
 import envs
 from dreamer_jax.files import read_json
-from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.runs.folder import folders, latents_folder
+from experiments.runs.folder import folders, latents_folder, read_evaluations
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.thesis.grid import SEEDS, THRESHOLDS, Cell, Table
 
@@ -103,7 +102,7 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
         for row in rows:
             if row["member"] == member:
                 env_steps.setdefault(row["env_steps"])
-                returns.setdefault(envs.spec(row["task"]).title, []).append(row["return"])
+                returns.setdefault(envs.described(row["task"]).title, []).append(row["return"])
         outcomes[cell] = Outcome(
             cell,
             tuple(env_steps),
@@ -117,8 +116,8 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
 def _read_run(folder: Path) -> tuple[RunSpec, list[dict]] | None:
     """A run's spec and the rows of its evaluations; a warning and nothing if it cannot be read."""
     try:
-        rows = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
-        return read_spec(folder), [row for row in rows if row["kind"] == "evaluation"]
+        rows = read_evaluations(folder) if (folder / "metrics.jsonl").exists() else []
+        return read_spec(folder), rows
     except (ValueError, KeyError, TypeError) as error:
         warnings.warn(
             f"{folder} cannot be read ({error}): its cells count as missing", stacklevel=3
@@ -136,7 +135,8 @@ def read_classification(
     try:
         found = read_json(path)
         rows = {
-            (row["threshold"], envs.spec(row["task"]).title): row for row in found["accuracies"]
+            (row["threshold"], envs.described(row["task"]).title): row
+            for row in found["accuracies"]
         }
         scaled = dict.fromkeys(row["threshold"] for row in found["accuracies"])
         shares = tuple(

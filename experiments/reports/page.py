@@ -14,12 +14,13 @@ from typing import NamedTuple
 
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
+from dreamer_jax.schema import RUN, check_shape
 from envs import SimulatorError
 from experiments.reports import comparison, figures, publication
 from experiments.reports.comparison import Aggregate
 from experiments.reports.outcomes import Outcome, read_classification, read_outcomes
 from experiments.reports.publication import Box, Sheet
-from experiments.runs.folder import CELLS, folders
+from experiments.runs.folder import folders, read_cells
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
 from experiments.thesis.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
@@ -343,8 +344,8 @@ def _provenance(root: Path) -> str:
     rows, versions = [], {}
     for folder in sorted({folder for folder, _ in folders(root).values()}):
         try:
-            header = read_json(folder / "run.json")
-            names = read_json(folder / CELLS)
+            header = check_shape(read_json(folder / "run.json"), RUN, folder / "run.json")
+            names = read_cells(folder)
             found = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
         except (OSError, ValueError) as error:
             rows.append((_text(folder.name), "-", "-", _text(error), "-"))

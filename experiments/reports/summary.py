@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 import envs
-from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
+from dreamer_jax.schema import COUNT
 from experiments.reports.levels import draw_levels
 from experiments.reports.statistics import FINAL_SHARE, mean_and_deviation
+from experiments.runs.folder import read_evaluations
 from experiments.runs.spec import BASELINE, RunSpec, read_spec
 from experiments.runs.text import aligned, titles
 
@@ -46,7 +47,7 @@ class Summary:
 
 def evaluations(directory: str | Path) -> list[dict[str, Any]]:
     """The evaluation rows of a results folder's metrics."""
-    return [row for row in read_metrics(directory) if row["kind"] == "evaluation"]
+    return read_evaluations(directory, label=str, seed=COUNT)
 
 
 def _statistics(rows: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
@@ -269,7 +270,7 @@ def plot_comparison(directories: Sequence[Path], path: str | Path) -> list[Path]
         found = _curves(directory, name)
         called = titles(found)
         for task, curves in found.items():
-            title = envs.spec(task).title
+            title = envs.described(task).title
             if called[task] != title:
                 curves = [replace(curve, text=f"{curve.text}, {task}") for curve in curves]
             panels.setdefault(title, []).extend(curves)

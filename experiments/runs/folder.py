@@ -9,10 +9,13 @@ import contextlib
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
 from dreamer_jax.integrity import DamagedError, read_sealed_json
+from dreamer_jax.logs import read_metrics
+from dreamer_jax.schema import EVALUATION_ROW, check_shape
 
 CELLS = "cells.json"
 
@@ -59,6 +62,22 @@ def read_cells(folder: Path) -> tuple[str, ...]:
         if isinstance(header, dict) and header.get("cells", names) != names:
             raise ValueError(f"{folder / CELLS} names other cells than run.json: restore it")
     return tuple(names)
+
+
+def read_evaluations(directory: str | Path, **also: Any) -> list[dict[str, Any]]:
+    """The rows of a results folder's evaluations.
+
+    Args:
+      directory: the folder.
+      also: names that rows must have besides those that all have, and their kinds.
+
+    Raises:
+      DamagedError: one lacks what the rows of evaluations have; names the file.
+    """
+    rows = [row for row in read_metrics(directory) if row["kind"] == "evaluation"]
+    for row in rows:
+        check_shape(row, EVALUATION_ROW | also, Path(directory) / "metrics.jsonl")
+    return rows
 
 
 def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
