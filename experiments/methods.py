@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import transfer
-from dreamer_jax.agent import AgentState
+from dreamer_jax.learning import AgentState
 from experiments.agents import (
     KNOWN_SAMPLES,
     Source,
