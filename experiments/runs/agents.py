@@ -29,13 +29,9 @@ def make_agent(spec: RunSpec) -> Agent:
     if (chosen := spec.method.plan()) is None:
         return agent
     fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
-    kept = {
-        "/".join(path.split("/")[:2])
-        for path, rule in transfer.claims(chosen, fresh).items()
-        if rule.frozen
-    }
+    kept = [path for path, rule in transfer.claims(chosen, fresh).items() if rule.frozen]
     learning = spec.config.learning
-    learning = dataclasses.replace(learning, frozen=(*learning.frozen, *sorted(kept)))
+    learning = dataclasses.replace(learning, frozen=(*learning.frozen, *kept))
     return dataclasses.replace(agent, config=dataclasses.replace(spec.config, learning=learning))
 
 
