@@ -1,4 +1,4 @@
-"""Arrays in ``.npz`` files: zip archives of NumPy's own format, compressed or not."""
+"""Arrays in `.npz` files: zip archives of NumPy's own format, compressed or not."""
 
 import io
 import json
@@ -46,7 +46,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class NpzFile(ArrayFile):
-    """An ``.npz`` file. Zip's own checksum of an array is compared whenever it is read."""
+    """An `.npz` file. Zip's own checksum of an array is compared whenever it is read."""
 
     def __init__(self, path: Path, max_bytes: int | None):
         super().__init__(path, max_bytes)

@@ -3,15 +3,15 @@ r"""Patterns over paths: globs that remember what they stood for.
 A *pattern* is a glob over the parts of a '/'-joined path:
 
 =======================  ========================================================
-``reward/out/*``         ``*`` and ``?`` and ``[ab]`` match inside one part
-``dynamics/**``          ``**`` stands for any number of parts, none included
-``layers/{i}/kernel``    ``{i}`` matches as ``*`` does, one character at least, and
-                         is remembered by its name; ``{i:**}`` matches as ``**``
-``!dynamics/gru/*``      ``!`` takes leaves away from what came before it
-``w\[0]``, ``\!w``     a backslash makes the next character an ordinary one
+`reward/out/*`         `*` and `?` and `[ab]` match inside one part
+`dynamics/**`          `**` stands for any number of parts, none included
+`layers/{i}/kernel`    `{i}` matches as `*` does, one character at least, and
+                         is remembered by its name; `{i:**}` matches as `**`
+`!dynamics/gru/*`      `!` takes leaves away from what came before it
+`w\[0]`, `\!w`     a backslash makes the next character an ordinary one
 =======================  ========================================================
 
-:func:`escape` writes the pattern of one path, whatever characters it holds.
+`escape` writes the pattern of one path, whatever characters it holds.
 """
 
 import difflib
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 
 def match(pattern: str, path: str) -> bool:
-    """Whether a pattern (without a leading ``!``) matches a whole path.
+    """Whether a pattern (without a leading `!`) matches a whole path.
 
     >>> match("dynamics/**/kernel", "dynamics/prior/out/kernel"), match("*/out", "reward/out/bias")
     (True, False)
@@ -31,13 +31,13 @@ def match(pattern: str, path: str) -> bool:
 
 
 def captures(pattern: str, path: str) -> dict[str, str] | None:
-    """What the named parts of a pattern stand for in a path; ``None`` if it does not match.
+    """What the named parts of a pattern stand for in a path; `None` if it does not match.
 
     A name that comes twice stands for the same text twice. Of several ways to match, each
     wildcard takes as few parts as it can, the first of them first.
 
     Raises:
-        ValueError: a pattern that cannot be read, such as ``{1st}``.
+      ValueError: a pattern that cannot be read, such as `{1st}`.
 
     >>> captures("layers/{i}/{rest:**}", "layers/3/attention/kernel")
     {'i': '3', 'rest': 'attention/kernel'}
@@ -73,7 +73,7 @@ def captures(pattern: str, path: str) -> dict[str, str] | None:
 
 
 class _Several(NamedTuple):
-    """``**``, or ``{name:**}``."""
+    """`**`, or `{name:**}`."""
 
     name: str | None
 
@@ -83,7 +83,7 @@ def _with(found: dict[str, str], name: str | None, value: str) -> dict[str, str]
 
 
 def _merged(found: dict[str, str], new: dict[str, str]) -> dict[str, str] | None:
-    """Both together, or ``None`` where they differ."""
+    """Both together, or `None` where they differ."""
     if any(found.get(name, value) != value for name, value in new.items()):
         return None
     return {**found, **new}
@@ -141,7 +141,7 @@ def _part(part: str) -> "re.Pattern[str] | _Several":
 
 
 def _end_of_class(text: str) -> int | None:
-    """The place of the bracket that closes the class which ``text`` begins with."""
+    """The place of the bracket that closes the class which `text` begins with."""
     end = text.find("]", 3 if text.startswith("[!") else 2)
     return end if end > 0 else None
 
@@ -166,7 +166,7 @@ def escape(path: str) -> str:
 
 
 def suggest(pattern: str, names: Iterable[str]) -> str:
-    """Near misses for an error message: leaves, and branches written as ``branch/**``."""
+    """Near misses for an error message: leaves, and branches written as `branch/**`."""
     names = list(names)
     branches = sorted(
         {
@@ -195,7 +195,7 @@ def pattern_list(patterns: Sequence[Any]) -> tuple[str, ...]:
     """Patterns given one by one or as lists, as one tuple.
 
     Raises:
-        ValueError: what is given is no string, or nothing is given.
+      ValueError: what is given is no string, or nothing is given.
     """
     found: list[str] = []
     for pattern in patterns:
@@ -216,11 +216,11 @@ def is_list(value: Any) -> bool:
 
 
 def match_paths(names: Sequence[str], *patterns: Any, optional: bool = False) -> frozenset[str]:
-    """The names among ``names`` that the patterns select, taken in order.
+    """The names among `names` that the patterns select, taken in order.
 
     Raises:
-        ValueError: a pattern matches no name at all, unless ``optional``; the message lists near
-            misses.
+      ValueError: a pattern matches no name at all, unless `optional`; the message lists near
+        misses.
     """
     patterns = pattern_list(patterns)
     chosen: set[str] = set(names) if patterns[0].startswith("!") else set()

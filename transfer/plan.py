@@ -1,9 +1,9 @@
 """Plans: which operation happens to which leaf, as data.
 
-A :class:`Plan` is a list of rules (patterns -> operation). Every leaf of the target must be claimed
+A `Plan` is a list of rules (patterns -> operation). Every leaf of the target must be claimed
 by exactly one rule, or by the plan's explicit default: what a plan forgets is an error, and so is
 what it says twice. Plans are values: they print, compare, hash, cannot be changed, and go to YAML
-or JSON and back (see :mod:`transfer.plan_files`). :func:`transfer.apply` carries one out.
+or JSON and back (see `transfer.plan_files`). `transfer.apply` carries one out.
 """
 
 import dataclasses
@@ -94,7 +94,7 @@ def _tuples(array: np.ndarray) -> Any:
 
 
 class Reading(NamedTuple):
-    """Where a rule reads: which source (``None``: the only one) and which path (``None``: the
+    """Where a rule reads: which source (`None`: the only one) and which path (`None`: the
     target's own)."""
 
     name: str | None
@@ -117,34 +117,34 @@ class Rule:
     """What happens to the leaves that some patterns select.
 
     Attributes:
-        patterns: glob patterns, taken in order (see :func:`transfer.select`); one may be given as
-            a plain string.
-        operation: the name of an operation, such as ``"copy"``.
-        parameters: its keyword arguments. What is left out is given to :func:`transfer.apply` by
-            name. A number may differ with depth, ``{"values": [0, 0.5, 1], "over": "layer"}``: the
-            values are spread evenly over what ``{layer}`` in the pattern stands for, in between
-            linearly.
-        source: where the rule reads; ``None`` for the same path of the only source.
+      patterns: glob patterns, taken in order (see `transfer.select`); one may be given as
+        a plain string.
+      operation: the name of an operation, such as `"copy"`.
+      parameters: its keyword arguments. What is left out is given to `transfer.apply` by
+        name. A number may differ with depth, `{"values": [0, 0.5, 1], "over": "layer"}`: the
+        values are spread evenly over what `{layer}` in the pattern stands for, in between
+        linearly.
+      source: where the rule reads; `None` for the same path of the only source.
 
-            * ``"teacher"``: the same path of the source of that name, where there are several;
-            * ``"blk/{i}/attn/{rest}"``: another path of the only source, with what ``{i}`` and
-              ``{rest}`` in the pattern stand for. A path of a single part is written ``":weight"``;
-            * ``"teacher:blk/{i}/w"``: both. A name that holds a ``/`` ends with ``:``.
+        * `"teacher"`: the same path of the source of that name, where there are several;
+        * `"blk/{i}/attn/{rest}"`: another path of the only source, with what `{i}` and
+          `{rest}` in the pattern stand for. A path of a single part is written `":weight"`;
+        * `"teacher:blk/{i}/w"`: both. A name that holds a `/` ends with `:`.
 
-            A tuple names one source each for operations on several (``average``); for others it
-            names several leaves, or a path with ``*`` does, that the layout's first step joins.
-        optional: whether the patterns may match nothing (a head that not every agent has).
-        frozen: whether the leaves are meant to stay as they are in training. ``apply`` only says
-            so in its report; :func:`frozen` gives the mask that ``freeze`` acts on.
-        note: a word to the reader of the plan.
-        layout: steps from the arrays that are read to the one the operation takes, see
-            :mod:`transfer.layout`.
+        A tuple names one source each for operations on several (`average`); for others it
+        names several leaves, or a path with `*` does, that the layout's first step joins.
+      optional: whether the patterns may match nothing (a head that not every agent has).
+      frozen: whether the leaves are meant to stay as they are in training. `apply` only says
+        so in its report; `frozen` gives the mask that `freeze` acts on.
+      note: a word to the reader of the plan.
+      layout: steps from the arrays that are read to the one the operation takes, see
+        `transfer.layout`.
 
     Lists and arrays among these become tuples, so that a rule is a value that never changes.
 
     Raises:
-        ValueError: a field of the wrong type, a captured part that no pattern has, or a layout
-            with an unknown step.
+      ValueError: a field of the wrong type, a captured part that no pattern has, or a layout
+        with an unknown step.
     """
 
     patterns: tuple[str, ...]
@@ -227,7 +227,7 @@ class Rule:
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """What ``source`` says, entry by entry; one empty entry where it says nothing."""
+        """What `source` says, entry by entry; one empty entry where it says nothing."""
         if self.source is None:
             return (Reading(None, None),)
         return tuple(map(_reading, (self.source,) if isinstance(self.source, str) else self.source))
@@ -243,7 +243,7 @@ class Rule:
         return f"{', '.join(self.patterns)} -> {self.operation}"
 
     def describe(self) -> str:
-        """The operation with its parameters, as in ``fraction(omega=0.2)``."""
+        """The operation with its parameters, as in `fraction(omega=0.2)`."""
         arguments = [f"{name}={value}" for name, value in self.parameters.items()]
         if self.source is not None:
             arguments.append(f"source={self.source}")
@@ -253,7 +253,7 @@ class Rule:
 
 
 def is_gradient(value: Any) -> bool:
-    """Whether a parameter is ``{"values": ..., "over": name}``."""
+    """Whether a parameter is `{"values": ..., "over": name}`."""
     return isinstance(value, Mapping) and set(value) == {"values", "over"}
 
 
@@ -269,10 +269,10 @@ class Plan:
     """An ordered list of rules that together claim every leaf once.
 
     Attributes:
-        rules: the rules.
-        default: the operation for leaves that no rule claims (``"keep"``, ``"copy"``); with
-            ``None`` such leaves are an error.
-        name: what the plan is called when printed.
+      rules: the rules.
+      default: the operation for leaves that no rule claims (`"keep"`, `"copy"`); with
+        `None` such leaves are an error.
+      name: what the plan is called when printed.
 
     >>> plan = Plan((Rule("body/**", "copy"), Rule("head/**", "fraction", {"omega": 0.5})))
     >>> print(plan)
@@ -310,8 +310,8 @@ def claims(plan: Plan, target: PyTree) -> dict[str, Rule]:
     """The rule that claims each leaf of a target, by path, in tree order.
 
     Raises:
-        ValueError: a leaf claimed twice or by nobody, or a rule that is not optional and claims
-            nothing.
+      ValueError: a leaf claimed twice or by nobody, or a rule that is not optional and claims
+        nothing.
 
     >>> plan = Plan((Rule("head/**", "keep"),), default="copy")
     >>> found = claims(plan, {"body": {"w": jnp.ones(2)}, "head": {"w": jnp.ones(2)}})

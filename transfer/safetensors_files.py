@@ -1,4 +1,4 @@
-"""Arrays in ``.safetensors`` files: a length, a JSON header, and the bytes of all arrays.
+"""Arrays in `.safetensors` files: a length, a JSON header, and the bytes of all arrays.
 
 The format is read and written here, not by the package of that name, for what that cannot do: give
 NumPy 8-bit floating-point numbers, read one array without mapping the whole file, and keep a
@@ -85,7 +85,7 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class SafetensorsFile(ArrayFile):
-    """A ``.safetensors`` file. The checksum of an array is compared whenever it is read."""
+    """A `.safetensors` file. The checksum of an array is compared whenever it is read."""
 
     def __init__(self, path: Path, max_bytes: int | None):
         super().__init__(path, max_bytes)
