@@ -86,6 +86,11 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
         return FAILURE
 
 
+def console() -> int:
+    """The command `dreamer-transfer`."""
+    return main(program="dreamer-transfer")
+
+
 def _is_told(error: Exception) -> bool:
     """Whether an error's message says all that a user needs."""
     if isinstance(error, OSError | ModuleNotFoundError):

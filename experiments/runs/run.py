@@ -59,6 +59,7 @@ def make_run(
     resume: bool = False,
     workers: int | None = None,
     base: str | Path = "",
+    accept_failed: bool = False,
 ) -> Run:
     """Prepares a run: simulators, agents, and the results folder.
 
@@ -68,6 +69,7 @@ def make_run(
       resume: continue what the folder holds.
       workers: simulator processes; by default one per core.
       base: the folder that the spec's relative paths start from; by default the working directory.
+      accept_failed: take sources that failed, as they were before.
 
     Raises:
       ValueError: the folder holds another run, or a source does not fit.
@@ -88,7 +90,9 @@ def make_run(
             )
     state, report = None, None
     if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
-        state, report = transferred_members(spec, load_sources(spec, base), workers=workers)
+        state, report = transferred_members(
+            spec, load_sources(spec, base, accept_failed=accept_failed), workers=workers
+        )
     agent = make_agent(spec)
     env = make_env(spec, workers=workers)
     try:

@@ -48,7 +48,9 @@ class Progress:
 Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
 
 
-def train(run: PlannedRun, root: Path, workers: int | None) -> Literal["finished", "stopped"]:
+def train(
+    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
+) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
     Raises:
@@ -63,7 +65,16 @@ def train(run: PlannedRun, root: Path, workers: int | None) -> Literal["finished
         write_json_atomically(folder / CELLS, list(run.cells))
         spec = in_memory(spec)
     try:
-        return carry_out(make_run(spec, folder, resume=True, workers=workers, base=root))
+        return carry_out(
+            make_run(
+                spec,
+                folder,
+                resume=True,
+                workers=workers,
+                base=root,
+                accept_failed=accept_failed,
+            )
+        )
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
