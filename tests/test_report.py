@@ -7,19 +7,23 @@ import pytest
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from experiments.__main__ import main
+from experiments.methods.fractional import FractionalTransfer
+from experiments.methods.scratch import Scratch
 from experiments.reports import summary
 from experiments.reports.levels import draw_levels
 from experiments.runs.spec import RunSpec
+
+SCRATCH = Scratch()
 
 
 @pytest.fixture
 def folder(tmp_path):
     """Writes a run whose every evaluation of a task gives that task's return."""
 
-    def make(name, returns, **settings):
+    def make(name, returns, method=SCRATCH):
         directory = tmp_path / name
         directory.mkdir(parents=True)
-        spec = RunSpec(tuple(returns), (0, 1), preset("debug"), **settings)
+        spec = RunSpec(tuple(returns), (0, 1), preset("debug"), method)
         write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
         rows = [
             {"kind": "evaluation", "member": number, "seed": member.seed, "label": member.label}
@@ -64,7 +68,9 @@ def test_curves_are_told_apart_by_folder_label_and_simulator(folder, tmp_path, m
     panels = drawn(monkeypatch)
     both = folder("a/run", {"bullet/hopper": 0.0, "brax/hopper": 0.0, "brax/ant": 0.0})
     targets = folder(
-        "b/run", {"brax/ant": 0.0}, sources=("source",), omegas=(0.0, 0.2), baseline=True
+        "b/run",
+        {"brax/ant": 0.0},
+        FractionalTransfer(sources=("source",), omegas=(0.0, 0.2), baseline=True),
     )
     summary.plot_comparison([both, targets], "picture")
     a, b = map(str, (both, targets))

@@ -14,8 +14,8 @@ from experiments.reports import comparison
 from experiments.reports.levels import draw_levels
 from experiments.reports.outcomes import Outcome
 from experiments.thesis import grid
-from experiments.thesis.graph import task_name
 from experiments.thesis.grid import Cell, Figure
+from experiments.thesis.populations import task_name
 
 TRANSFER, BASELINE = "tab:blue", "tab:green"
 """The thesis's colours."""

@@ -127,7 +127,8 @@ def size_note(root: Path) -> str | None:
     changed = changed_settings(root)
     if root.name == "thesis" and not changed:
         return None
-    return f"preset {', '.join([root.name, *changed])}: not comparable in size"
+    told = [f"{one.path.rpartition('.')[2]} {one.one}" for one in changed]
+    return f"preset {', '.join([root.name, *told])}: not comparable in size"
 
 
 def _title(table: Table) -> str:
