@@ -15,6 +15,7 @@ from experiments.methods.meta_modules import meta_dynamics, meta_head
 import transfer
 from dreamer_jax import config
 from dreamer_jax.agent import Agent
+from experiments.methods.modules.meta import meta_dynamics, meta_head
 from transfer import recipes
 from transfer_trees import bits
 
