@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from experiments.methods.meta_modules import meta_dynamics, meta_head
 
 import transfer
 from dreamer_jax import config
