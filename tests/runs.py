@@ -12,8 +12,8 @@ from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.schedule import Counters, Schedule
-from experiments.agents import Source, load_source, make_agent, plan
-from experiments.spec import RunSpec
+from experiments.runs.agents import Source, load_source, make_agent, plan
+from experiments.runs.spec import RunSpec
 
 CONFIG = preset("debug")
 

@@ -6,10 +6,11 @@ import shutil
 import pytest
 
 from dreamer_jax.config import preset
-from experiments import grid
-from experiments.graph import plan_runs
-from experiments.grid import FIGURES, TABLES, closure, shown
-from experiments.results import folders, read_cells, read_outcomes
+from experiments.reports.outcomes import read_outcomes
+from experiments.runs.folder import folders, read_cells
+from experiments.thesis import grid
+from experiments.thesis.graph import plan_runs
+from experiments.thesis.grid import FIGURES, TABLES, closure, shown
 from runs import CONFIG, finish
 
 

@@ -16,11 +16,10 @@ from dreamer_jax import rssm
 from dreamer_jax.agent import Batch
 from dreamer_jax.networks import Head
 from dreamer_jax.rollout import Records
-from experiments import methods
-from experiments.agents import make_agent, plan
-from experiments.latents import infer
-from experiments.meta_modules import recognise
-from experiments.methods import load_sources, stored_models, transferred_members
+from experiments.methods.meta_modules import recognise
+from experiments.runs.agents import make_agent, plan
+from experiments.runs.latents import infer
+from experiments.runs.start import load_sources, stored_models, transferred_members
 from runs import CONFIG, batch_for, random_params, spec_of, write_run
 from transfer.ltc import NOVEL
 from transfer_trees import bits
@@ -209,7 +208,7 @@ def test_exactly_what_is_frozen_does_not_move_by_a_bit_in_a_thousand_updates(fol
         folder, "hopper", "ant", suffix="_frozen", dynamics="frozen", meta=("reward", "value"),
         switching=True,
     )  # fmt: skip
-    monkeypatch.setattr(methods, "known_tasks", lambda *_, **__: classifier_of(0.5))
+    monkeypatch.setattr("experiments.runs.start.known_tasks", lambda *_, **__: classifier_of(0.5))
     agent, sources = make_agent(spec), load_sources(spec)
     state, report = transferred_members(spec, sources)
     start, batch = member(state, 0), batch_for(agent)
@@ -467,8 +466,8 @@ def test_a_spec_says_all_of_a_method_after_json(folder):
 
 
 def test_latent_states_that_are_not_finite_are_novel_and_counted():
-    from experiments.classify import distance_table, judge, to_dict
-    from experiments.latents import Latents
+    from experiments.runs.classify import distance_table, judge, to_dict
+    from experiments.runs.latents import Latents
 
     random = np.random.default_rng(0)
     episodes = np.arange(20) // 4

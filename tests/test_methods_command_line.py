@@ -11,8 +11,8 @@ from numpy.testing import assert_array_equal
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.logs import read_metrics
 from experiments.__main__ import main
-from experiments.agents import load_source
-from experiments.methods import known_tasks, load_sources
+from experiments.runs.agents import load_source
+from experiments.runs.start import known_tasks, load_sources
 from runs import spec_of, write_run
 from transfer_trees import bits
 

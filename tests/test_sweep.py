@@ -9,13 +9,13 @@ import pytest
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from envs import SimulatorError
-from experiments import estimate
-from experiments import sweep as sweeps
-from experiments.estimate import Speed, plan_table
-from experiments.graph import plan_runs
-from experiments.grid import TABLES, closure, shown
-from experiments.results import folders
-from experiments.sweep import carry_out_runs
+from experiments.runs.folder import folders
+from experiments.thesis import estimate
+from experiments.thesis import sweep as sweeps
+from experiments.thesis.estimate import Speed, plan_table
+from experiments.thesis.graph import plan_runs
+from experiments.thesis.grid import TABLES, closure, shown
+from experiments.thesis.sweep import carry_out_runs
 from runs import CONFIG, finish
 
 TWO_TARGETS = (

@@ -10,11 +10,12 @@ from pathlib import Path
 import gymnasium
 
 import envs
-from experiments import comparison, grid
-from experiments.graph import task_name
-from experiments.grid import Cell, Figure
-from experiments.levels import draw_levels
-from experiments.results import Outcome
+from experiments.reports import comparison
+from experiments.reports.levels import draw_levels
+from experiments.reports.outcomes import Outcome
+from experiments.thesis import grid
+from experiments.thesis.graph import task_name
+from experiments.thesis.grid import Cell, Figure
 
 TRANSFER, BASELINE = "tab:blue", "tab:green"
 """The thesis's colours."""

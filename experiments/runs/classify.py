@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 import envs
-from experiments.agents import Source
-from experiments.latents import Features, Latents, Policy, gather, phases_for
-from experiments.report import aligned, titles
+from experiments.runs.agents import Source
+from experiments.runs.latents import Features, Latents, Policy, gather, phases_for
+from experiments.runs.text import aligned, titles
 from transfer import ltc
 from transfer.recipes import latent_task_thresholds
 

@@ -14,7 +14,7 @@ import numpy as np
 
 import transfer
 from dreamer_jax.agent import AgentState
-from experiments.agents import (
+from experiments.runs.agents import (
     KNOWN_SAMPLES,
     Source,
     check_source,
@@ -22,8 +22,8 @@ from experiments.agents import (
     make_agent,
     plan,
 )
-from experiments.latents import gather, phases_for
-from experiments.spec import RunSpec
+from experiments.runs.latents import gather, phases_for
+from experiments.runs.spec import RunSpec
 from transfer import ltc
 from transfer.meta_model import StoredHeads, store
 

@@ -10,8 +10,8 @@ from typing import Literal
 import tyro
 
 from dreamer_jax.config import Config
-from experiments.exits import STOPPED, UsageError, usage_errors
-from experiments.grid import SEEDS, Backend
+from experiments.cli.exits import STOPPED, UsageError, usage_errors
+from experiments.thesis.grid import SEEDS, Backend
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ class Report:
 
 def train(command: Train) -> int:
     """Trains a population."""
-    from experiments.run import carry_out, make_run
-    from experiments.spec import RunSpec
+    from experiments.runs.run import carry_out, make_run
+    from experiments.runs.spec import RunSpec
 
     with usage_errors():
         spec = RunSpec(
@@ -179,26 +179,26 @@ def train(command: Train) -> int:
 
 def report(command: Report) -> int:
     """Shows a run, several beside each other, or all results under a folder."""
-    from experiments import report
-    from experiments.grid_commands import report_all
-    from experiments.results import run_folders
+    from experiments.cli.thesis import report_all
+    from experiments.reports import summary
+    from experiments.runs.folder import run_folders
 
     if not command.directories:
         raise UsageError("nothing to report: name a results folder, or several")
     if len(command.directories) > 1:
         with usage_errors():
-            print(report.table(report.compare(command.directories)))
-            picture, _ = report.plot_comparison(command.directories, command.out)
+            print(summary.table(summary.compare(command.directories)))
+            picture, _ = summary.plot_comparison(command.directories, command.out)
         print(f"learning curves: {picture}")
         return 0
     (directory,) = command.directories
     if not (directory / "run.json").exists() and run_folders(directory):
         return report_all(directory, command.seeds, command.backend)
     with usage_errors():
-        summaries = report.summarise(directory)
-    print(report.table(summaries))
-    if report.evaluations(directory):
-        picture, _ = report.plot_curves(directory)
+        summaries = summary.summarise(directory)
+    print(summary.table(summaries))
+    if summary.evaluations(directory):
+        picture, _ = summary.plot_curves(directory)
         print(f"learning curves: {picture}")
     return 0
 
@@ -209,8 +209,8 @@ def evaluate(command: Evaluate) -> int:
     from rich.progress import Progress
 
     from dreamer_jax.files import write_json_atomically
-    from experiments.evaluate import evaluate, load_agents
-    from experiments.report import aligned
+    from experiments.runs.evaluate import evaluate, load_agents
+    from experiments.runs.text import aligned
 
     if command.episodes < 1:
         raise UsageError(f"--episodes is {command.episodes}, must be at least 1")
@@ -258,8 +258,8 @@ def classify(command: Classify) -> int:
     from rich.progress import Progress
 
     from dreamer_jax.files import write_json_atomically
-    from experiments import classify
-    from experiments.agents import load_source
+    from experiments.runs import classify
+    from experiments.runs.agents import load_source
 
     request = {
         "samples": command.samples,

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from dreamer_jax.files import write_json_atomically
-from experiments import classify
-from experiments.agents import load_source
-from experiments.graph import task_name
-from experiments.grid import AUTOENCODER, TASKS, Backend, Table, multitask
-from experiments.latents import Latents, gather
-from experiments.results import folders, latents_folder
+from experiments.runs import classify
+from experiments.runs.agents import load_source
+from experiments.runs.folder import folders, latents_folder
+from experiments.runs.latents import Latents, gather
+from experiments.thesis.graph import task_name
+from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, Table, multitask
 
 SAMPLES = 100
 """Of each task to fit on, and as many to test (section 4.3.2)."""
@@ -50,7 +50,7 @@ def make_table(
       report: called after each round of gathering, with how many are done and how many there are.
 
     Returns:
-      The file of accuracies, which `results.read_classification` reads.
+      The file of accuracies, which `reports.outcomes.read_classification` reads.
 
     Raises:
       ValueError: the agent is not trained, or its samples are damaged.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from dreamer_jax.files import read_json
-from experiments.grid import DEMO, TABLES, Table
+from experiments.thesis.grid import DEMO, TABLES, Table
 
 PATH = Path(__file__).with_name("published.json")
 COPIES = (4, 6, 8, 12)

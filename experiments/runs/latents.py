@@ -19,7 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.rollout import Records, collect
-from experiments.agents import Source, make_agent
+from experiments.runs.agents import Source, make_agent
 
 # Phases of training and of evaluations are numbered below; starts of these are new ones.
 FIRST_PHASE = 2_000_000

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments import grid, published, statistics
-from experiments.grid import Cell, Metric, Table
-from experiments.published import Published
-from experiments.results import Outcome
-from experiments.statistics import Estimate
+from experiments.reports import statistics
+from experiments.reports.outcomes import Outcome
+from experiments.reports.statistics import Estimate
+from experiments.thesis import grid, published
+from experiments.thesis.grid import Cell, Metric, Table
+from experiments.thesis.published import Published
 
 # Intervals are the same whenever and in whatever order tables are written.
 DRAWS_SEED = 0

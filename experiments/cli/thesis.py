@@ -13,9 +13,9 @@ from typing import Literal
 import tyro
 
 from dreamer_jax import config as configs
-from experiments import grid
-from experiments.exits import FAILURE, STOPPED, usage_errors
-from experiments.grid import Backend, Figure, Table
+from experiments.cli.exits import FAILURE, STOPPED, usage_errors
+from experiments.thesis import grid
+from experiments.thesis.grid import Backend, Figure, Table
 
 Preset = Literal["thesis", "cpu", "demo", "debug"]
 
@@ -144,7 +144,7 @@ def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
 
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
     """The runs behind tables and figures."""
-    from experiments.graph import plan_runs
+    from experiments.thesis.graph import plan_runs
 
     with usage_errors():
         if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
@@ -169,7 +169,7 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     Raises:
       UsageError: results of other settings are there, or a simulator is not installed.
     """
-    from experiments.sweep import carry_out_runs
+    from experiments.thesis.sweep import carry_out_runs
 
     runs = _planned(entries, sweep)
     with usage_errors():
@@ -193,7 +193,7 @@ def _tell_problems(progress) -> int:
 
 def plan(command: Plan) -> int:
     """Shows the graph with an estimate."""
-    from experiments import estimate
+    from experiments.thesis import estimate
 
     sweep = command.sweep
     with usage_errors():
@@ -226,7 +226,7 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     """Trains what is missing and writes tables and figures."""
     from rich.progress import Progress
 
-    from experiments.latent_tables import make_table
+    from experiments.thesis.latent_tables import make_table
 
     runs, progress = _carry_out(entries, sweep)
     if progress.stopped:
@@ -261,8 +261,8 @@ def _write(
     entries: Sequence[Table | Figure], root: Path, seeds: tuple[int, ...], backend: Backend
 ) -> None:
     """Writes tables, figures, and the page of all results under a root."""
-    from experiments import page, publication
-    from experiments.results import report_folder
+    from experiments.reports import page, publication
+    from experiments.runs.folder import report_folder
 
     folder = report_folder(root, backend)
     folder.mkdir(parents=True, exist_ok=True)
@@ -278,7 +278,8 @@ def _write(
 
 def report_all(root: Path, seeds: tuple[int, ...], backend: Backend) -> int:
     """Writes all tables and figures of which there is something, and the page. Trains nothing."""
-    from experiments.results import folders, read_classification
+    from experiments.reports.outcomes import read_classification
+    from experiments.runs.folder import folders
 
     held = folders(root)
     entries = []
@@ -296,8 +297,9 @@ def report_all(root: Path, seeds: tuple[int, ...], backend: Backend) -> int:
 
 def demo(command: Demo) -> int:
     """Runs the grid's entry of that name and shows what came of it."""
-    from experiments import evaluate, report
-    from experiments.results import folders
+    from experiments.reports import summary
+    from experiments.runs import evaluate
+    from experiments.runs.folder import folders
 
     sweep = Sweep(
         command.preset,
@@ -312,13 +314,13 @@ def demo(command: Demo) -> int:
     places = folders(sweep.root)
     for folder in dict.fromkeys(places[cell.name][0] for cell in grid.shown(grid.DEMO, (0, 1))):
         evaluate.evaluate(evaluate.load_agents(folder), 1, video=True, workers=sweep.workers)
-        pictures = report.plot_curves(folder)
+        pictures = summary.plot_curves(folder)
         if (folder / "transfer.txt").exists():
             print("\nWhat was transferred, leaf by leaf (norms are means over the targets)\n")
             print((folder / "transfer.txt").read_text())
         title = grid.DEMO.targets[0]
         print(f"Return of evaluation episodes on {title}, mean ± standard deviation\n")
-        print(report.table(report.summarise(folder)))
+        print(summary.table(summary.summarise(folder)))
         for path in (*pictures, *sorted((folder / "videos").glob("*.mp4"))):
             print(f"wrote {path}")
     print("\n" + _scale(configs.preset(command.preset)))

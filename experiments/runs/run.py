@@ -19,9 +19,9 @@ import transfer
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.training import Run
-from experiments.agents import make_agent, make_env
-from experiments.methods import load_sources, transferred_members
-from experiments.spec import RunSpec, read_spec
+from experiments.runs.agents import make_agent, make_env
+from experiments.runs.spec import RunSpec, read_spec
+from experiments.runs.start import load_sources, transferred_members
 
 
 def _versions() -> dict[str, str]:
@@ -38,7 +38,7 @@ def _versions() -> dict[str, str]:
 
 def _revision() -> str:
     """The commit of the source tree, marked if it was changed since; else the package's version."""
-    tree = Path(__file__).parent.parent
+    tree = Path(__file__).parents[2]
     if (tree / ".git").exists():
         command = ["git", "-C", str(tree), "describe", "--always", "--dirty"]
         try:

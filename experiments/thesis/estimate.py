@@ -22,10 +22,10 @@ from dreamer_jax.config import Config
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
-from experiments.agents import make_agent
-from experiments.graph import PlannedRun
-from experiments.report import aligned
-from experiments.spec import RunSpec, action_size
+from experiments.runs.agents import make_agent
+from experiments.runs.spec import RunSpec, action_size
+from experiments.runs.text import aligned
+from experiments.thesis.graph import PlannedRun
 
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
 

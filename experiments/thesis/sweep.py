@@ -17,10 +17,10 @@ from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tr
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
-from experiments.estimate import in_memory
-from experiments.graph import PlannedRun
-from experiments.results import CELLS, begun, set_aside
-from experiments.run import carry_out, make_run
+from experiments.runs.folder import CELLS, begun, set_aside
+from experiments.runs.run import carry_out, make_run
+from experiments.thesis.estimate import in_memory
+from experiments.thesis.graph import PlannedRun
 
 
 @dataclass

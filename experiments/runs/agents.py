@@ -15,8 +15,8 @@ import envs
 import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
-from experiments.meta_modules import meta_dynamics, meta_head
-from experiments.spec import RunSpec, action_size, read_spec
+from experiments.methods.meta_modules import meta_dynamics, meta_head
+from experiments.runs.spec import RunSpec, action_size, read_spec
 from transfer.recipes import fractional_transfer, meta_model, universal_autoencoder
 
 KNOWN_SAMPLES = 100

@@ -1,28 +1,20 @@
 """What is known of the grid's cells: the results folders under one root, read.
 
-A run's folder holds cells.json beside what `experiments.run` writes: the names of its cells, in
-the order of its members. Nothing else says where a cell is, so that folders may be copied to
-another machine and read there. A folder that cannot be read is warned of, and its cells count as
-missing.
+A folder that cannot be read is warned of, and its cells count as missing.
 """
 
-import re
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import envs
-from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.grid import SEEDS, THRESHOLDS, Backend, Cell, Table
-from experiments.spec import RunSpec, read_spec
-
-CELLS = "cells.json"
-
-_SET_ASIDE = re.compile(r"\.corrupt-\d+$")
+from experiments.runs.folder import folders, latents_folder
+from experiments.runs.spec import RunSpec, read_spec
+from experiments.thesis.grid import SEEDS, THRESHOLDS, Cell, Table
 
 
 @dataclass(frozen=True)
@@ -92,58 +84,6 @@ class Classification:
     shares: tuple[Share, ...]
 
 
-def run_folders(root: str | Path) -> list[Path]:
-    """The folders under a root that hold a run of cells that has begun, set-aside ones left out."""
-    found = sorted(path.parent for path in Path(root).glob(f"*/{CELLS}"))
-    return [path for path in found if not _SET_ASIDE.search(path.name) and begun(path)]
-
-
-def begun(folder: Path) -> bool:
-    """Whether a folder holds more of a run than what it was going to be."""
-    metrics = folder / "metrics.jsonl"
-    if metrics.exists() and metrics.stat().st_size > 0:
-        return True
-    return Checkpointer(folder / "checkpoints").latest() is not None
-
-
-def set_aside(folder: Path) -> Path:
-    """Renames a folder that cannot be used, so that nothing reads it and its name is free.
-
-    Returns:
-      What it is called now.
-    """
-    number = 1
-    while (path := folder.with_name(f"{folder.name}.corrupt-{number}")).exists():
-        number += 1
-    return folder.rename(path)
-
-
-def read_cells(folder: Path) -> tuple[str, ...]:
-    """The names of a run's cells, in the order of its members.
-
-    Raises:
-      ValueError: cells.json is damaged.
-    """
-    names = read_json(folder / CELLS)
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{folder / CELLS} is no list of names")
-    return tuple(names)
-
-
-def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
-    """Where each cell is: its name -> (results folder, member)."""
-    found = {}
-    for folder in run_folders(root):
-        try:
-            names = read_cells(folder)
-        except ValueError as error:
-            warnings.warn(f"{error}: its cells count as missing", stacklevel=2)
-            continue
-        for member, name in enumerate(names):
-            found.setdefault(name, (folder, member))
-    return found
-
-
 def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome]:
     """The outcome of each cell, those that have not begun included."""
     places = folders(root)
@@ -184,16 +124,6 @@ def _read_run(folder: Path) -> tuple[RunSpec, list[dict]] | None:
             f"{folder} cannot be read ({error}): its cells count as missing", stacklevel=3
         )
         return None
-
-
-def latents_folder(root: str | Path, backend: Backend, seed: int) -> Path:
-    """Where latent states of all tasks and what was told of them are."""
-    return Path(root) / f"latents-{backend}-seed-{seed}"
-
-
-def report_folder(root: str | Path, backend: Backend) -> Path:
-    """Where tables, figures and the page are, each simulator's apart."""
-    return Path(root) / ("report" if backend == "bullet" else f"report-{backend}")
 
 
 def read_classification(

@@ -1,7 +1,7 @@
 """Tables and figures of the thesis, ours beside the published numbers, as text and files.
 
 A run that is not complete is shown as such, with the count of its evaluations, and never as a
-number. Figures are drawn by `experiments.figures`.
+number. Figures are drawn by `experiments.reports.figures`.
 """
 
 import csv
@@ -11,13 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import comparison, figures, grid, published, results, statistics
-from experiments.comparison import Entry
-from experiments.graph import changed_settings
-from experiments.grid import Cell, Figure, Table
-from experiments.report import aligned
-from experiments.results import Outcome
-from experiments.statistics import Estimate, Verdict
+from experiments.reports import comparison, figures, statistics
+from experiments.reports.comparison import Entry
+from experiments.reports.outcomes import Outcome, read_classification, read_outcomes
+from experiments.reports.statistics import Estimate, Verdict
+from experiments.runs.text import aligned
+from experiments.thesis import grid, published
+from experiments.thesis.graph import changed_settings
+from experiments.thesis.grid import Cell, Figure, Table
 
 COLOURS = {"positive": "#d6efd8", "neutral": "#eeeeee", "negative": "#f9d9d6"}
 """Behind the words for a transfer."""
@@ -108,16 +109,16 @@ def write_figure(
     folder.mkdir(parents=True, exist_ok=True)
     if figure.kind == "tasks":
         return figures.draw_tasks(figure, folder / figure.name)
-    outcomes = results.read_outcomes(root, grid.shown(figure, seeds))
+    outcomes = read_outcomes(root, grid.shown(figure, seeds))
     return figures.draw_curves(figure, outcomes, seeds, size_note(root), folder / figure.name)
 
 
 def read_sheet(table: Table, root: Path, seeds: tuple[int, ...]) -> Sheet:
     """A table from the results folders under a root."""
     if table.kind == "ltc":
-        found = results.read_classification(root, table, seeds)
+        found = read_classification(root, table, seeds)
         return classification_sheet(table, found, size_note(root))
-    outcomes = results.read_outcomes(root, grid.shown(table, seeds))
+    outcomes = read_outcomes(root, grid.shown(table, seeds))
     return returns_sheet(table, outcomes, seeds, size_note(root))
 
 
@@ -286,7 +287,7 @@ def classification_sheet(table: Table, found, size: str | None) -> Sheet:
 
     Args:
       table: which one.
-      found: the `results.Classification`; None if it has not been made.
+      found: the `outcomes.Classification`; None if it has not been made.
       size: from `size_note`.
     """
     tasks, number = (*table.targets, *table.known), published.number(table)

@@ -7,7 +7,7 @@ all these returns, of all seeds together, as in the thesis (see `statistics.mean
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ import numpy as np
 import envs
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.levels import draw_levels
-from experiments.spec import BASELINE, RunSpec, read_spec
-from experiments.statistics import FINAL_SHARE, mean_and_deviation
+from experiments.reports.levels import draw_levels
+from experiments.reports.statistics import FINAL_SHARE, mean_and_deviation
+from experiments.runs.spec import BASELINE, RunSpec, read_spec
+from experiments.runs.text import aligned, titles
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,6 @@ def _statistics(rows: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
     return mean_and_deviation([row["return"] for row in rows]) if rows else None
 
 
-def titles(tasks: Iterable[str]) -> dict[str, str]:
-    """What each of some tasks is called beside the others: its title, or its name where another
-    simulator's has the same."""
-    found = {task: envs.spec(task).title for task in tasks}
-    count = Counter(found.values())
-    return {task: title if count[title] == 1 else task for task, title in found.items()}
-
-
 def labels(spec: RunSpec) -> list[str]:
     """The labels of a run's members, each once, the baseline last."""
     return list(dict.fromkeys(member.label for member in spec.members))
@@ -89,20 +82,6 @@ def summarise(directory: str | Path) -> list[Summary]:
                 )
             )
     return summaries
-
-
-def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as text: the first column to the left, the others to the right."""
-    lines = [list(header), *(list(row) for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    lines.insert(1, ["-" * width for width in widths])
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
 
 
 def table(summaries: Sequence[Summary]) -> str:

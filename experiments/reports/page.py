@@ -15,12 +15,14 @@ from typing import NamedTuple
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from envs import SimulatorError
-from experiments import comparison, figures, grid, publication, published, results
-from experiments.comparison import Aggregate
-from experiments.contradictions import CONTRADICTIONS
-from experiments.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
-from experiments.publication import Box, Sheet
-from experiments.results import Outcome
+from experiments.reports import comparison, figures, publication
+from experiments.reports.comparison import Aggregate
+from experiments.reports.outcomes import Outcome, read_classification, read_outcomes
+from experiments.reports.publication import Box, Sheet
+from experiments.runs.folder import CELLS, folders
+from experiments.thesis import grid, published
+from experiments.thesis.contradictions import CONTRADICTIONS
+from experiments.thesis.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
 
 STYLE = Path(__file__).with_name("page.css")
 LARGEST_VIDEOS = 16 * 2**20
@@ -86,7 +88,7 @@ def write_page(root: str | Path, seeds: Sequence[int], backend: Backend, path: s
         for cell in grid.shown(entry, seeds)
     ]
     cells = grid.closure(shown)
-    outcomes = results.read_outcomes(root, cells)
+    outcomes = read_outcomes(root, cells)
     sections = [
         Section("reading", "How to read this", "".join(f"<p>{text}</p>" for text in ABOUT)),
         *_chapters(tables, pictures, outcomes, root, seeds),
@@ -154,7 +156,7 @@ def _chapters(tables, pictures, outcomes, root: Path, seeds) -> list[Section]:
         if isinstance(entry, Figure):
             return _figure(entry, outcomes, size, seeds)
         if entry.kind == "ltc":
-            found = results.read_classification(root, entry, seeds)
+            found = read_classification(root, entry, seeds)
             sheet = publication.classification_sheet(entry, found, size)
             return _sheet(entry, sheet) + _latents(entry, root, seeds)
         return _sheet(entry, publication.returns_sheet(entry, outcomes, seeds, size))
@@ -339,10 +341,10 @@ def _contradictions() -> str:
 def _provenance(root: Path) -> str:
     """Each results folder: its agents, evaluations, revision and versions."""
     rows, versions = [], {}
-    for folder in sorted({folder for folder, _ in results.folders(root).values()}):
+    for folder in sorted({folder for folder, _ in folders(root).values()}):
         try:
             header = read_json(folder / "run.json")
-            names = read_json(folder / results.CELLS)
+            names = read_json(folder / CELLS)
             found = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
         except (OSError, ValueError) as error:
             rows.append((_text(folder.name), "-", "-", _text(error), "-"))

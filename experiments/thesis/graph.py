@@ -18,9 +18,9 @@ from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from dreamer_jax.config import Config
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Counters, Schedule
-from experiments.grid import Backend, Cell
-from experiments.results import CELLS, begun, read_cells, run_folders
-from experiments.spec import RunSpec, read_spec
+from experiments.runs.folder import CELLS, begun, read_cells, run_folders
+from experiments.runs.spec import RunSpec, read_spec
+from experiments.thesis.grid import Backend, Cell
 
 MULTITASK_STEPS = 2
 """Environment steps of an agent for several tasks, in those of one for one task (section 4.2.1)."""

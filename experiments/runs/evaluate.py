@@ -15,8 +15,8 @@ import numpy as np
 from dreamer_jax.agent import Agent, Batch
 from dreamer_jax.rollout import Episode, Records, collect, episodes
 from dreamer_jax.video import tile, write_video
-from experiments.agents import load_params, make_agent, make_env
-from experiments.spec import RunSpec, read_spec
+from experiments.runs.agents import load_params, make_agent, make_env
+from experiments.runs.spec import RunSpec, read_spec
 
 # Phases of training are numbered from 0; these lie beyond them, so starts are new ones.
 FIRST_PHASE = 1_000_000
