@@ -17,17 +17,18 @@ from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
-from experiments.cli import runs, thesis
+from experiments.cli import reports, runs, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 
 COMMANDS = {
     "train": (runs.Train, runs.train),
     "evaluate": (runs.Evaluate, runs.evaluate),
     "classify": (runs.Classify, runs.classify),
-    "report": (runs.Report, runs.report),
+    "report": (reports.Report, reports.report),
     "table": (thesis.Tables, thesis.tables),
     "figure": (thesis.Figures, thesis.figures),
     "plan": (thesis.Plan, thesis.plan),
+    "seeds": (reports.Seeds, reports.seeds),
     "demo": (thesis.Demo, thesis.demo),
 }
 """Options of each command, and what carries it out."""

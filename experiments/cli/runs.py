@@ -1,4 +1,4 @@
-"""Commands on one run: train, evaluate, classify, report. Their options, and what they do.
+"""Commands on one run: train, evaluate, classify. Their options, and what they do.
 
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
@@ -11,7 +11,6 @@ import tyro
 
 from dreamer_jax.config import Config
 from experiments.cli.exits import STOPPED, UsageError, usage_errors
-from experiments.thesis.grid import SEEDS, Backend
 
 
 @dataclass(frozen=True)
@@ -126,26 +125,9 @@ class Classify:
     """Simulator processes; by default one per core."""
 
 
-@dataclass(frozen=True)
-class Report:
-    """Print the table of a results folder and draw its learning curves.
-
-    Of several folders: of all of them beside each other. Of a folder of all results of a preset
-    (results/cpu): write all tables, figures and the page.
-    """
-
-    directories: tyro.conf.Positional[tuple[Path, ...]]
-    """The results folder, or several."""
-    out: Path = Path("comparison.png")
-    """Of several folders: the picture to draw; an .svg is written beside it."""
-    seeds: tuple[int, ...] = SEEDS
-    """Of all results: the seeds that tables and figures show."""
-    backend: Backend = "bullet"
-    """Of all results: the simulators."""
-
-
 def train(command: Train) -> int:
     """Trains a population."""
+    from experiments.cli.reports import Report, report
     from experiments.runs.run import carry_out, make_run
     from experiments.runs.spec import RunSpec
 
@@ -175,32 +157,6 @@ def train(command: Train) -> int:
         print(f"stopped and saved in {command.out}: the same command with --resume continues")
         return STOPPED
     return report(Report((command.out,)))
-
-
-def report(command: Report) -> int:
-    """Shows a run, several beside each other, or all results under a folder."""
-    from experiments.cli.thesis import report_all
-    from experiments.reports import summary
-    from experiments.runs.folder import run_folders
-
-    if not command.directories:
-        raise UsageError("nothing to report: name a results folder, or several")
-    if len(command.directories) > 1:
-        with usage_errors():
-            print(summary.table(summary.compare(command.directories)))
-            picture, _ = summary.plot_comparison(command.directories, command.out)
-        print(f"learning curves: {picture}")
-        return 0
-    (directory,) = command.directories
-    if not (directory / "run.json").exists() and run_folders(directory):
-        return report_all(directory, command.seeds, command.backend)
-    with usage_errors():
-        summaries = summary.summarise(directory)
-    print(summary.table(summaries))
-    if summary.evaluations(directory):
-        picture, _ = summary.plot_curves(directory)
-        print(f"learning curves: {picture}")
-    return 0
 
 
 def evaluate(command: Evaluate) -> int:
