@@ -33,11 +33,12 @@ def random_params(agent, seed=0):
     return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
 
 
-def write_run(directory, spec: RunSpec, seed=0, keep=False) -> Source:
+def write_run(directory, spec: RunSpec, seed=0, keep=False, counters=None) -> Source:
     """A results folder of agents with random parameters, after the run's method.
 
     Args:
       keep: leave what the folder holds beside the parameters as it is.
+      counters: how far the run is, for what asks.
 
     Returns:
       Its first agent.
@@ -54,7 +55,8 @@ def write_run(directory, spec: RunSpec, seed=0, keep=False) -> Source:
         step = checkpoints.latest()
         checkpoints.save(step, {"agent": {"params": params}}, checkpoints.metadata(step))
         return load_source(directory)
-    checkpoints.save(0, {"agent": {"params": params}}, {})
+    metadata = {} if counters is None else {"counters": counters}
+    checkpoints.save(0, {"agent": {"params": params}}, metadata)
     write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
     return load_source(directory)
 

@@ -17,7 +17,7 @@ from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
-from experiments.cli import reports, runs, thesis
+from experiments.cli import reports, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 
 COMMANDS = {
@@ -25,6 +25,8 @@ COMMANDS = {
     "evaluate": (runs.Evaluate, runs.evaluate),
     "classify": (runs.Classify, runs.classify),
     "report": (reports.Report, reports.report),
+    "export": (sharing.Export, sharing.export),
+    "zoo": (sharing.Zoo, sharing.zoo),
     "table": (thesis.Tables, thesis.tables),
     "figure": (thesis.Figures, thesis.figures),
     "plan": (thesis.Plan, thesis.plan),

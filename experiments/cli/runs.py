@@ -31,8 +31,9 @@ class Train:
     preset: Literal["thesis", "cpu", "demo", "debug"] = "cpu"
     """Settings to start from; each can be overridden by its name below."""
     source: tuple[Path, ...] = ()
-    """Results folder of the agent to transfer from. Fractional transfer takes several: each has
-    targets of its own in the population."""
+    """The agent to transfer from: a results folder, a .safetensors file that `export` wrote, or
+    zoo:NAME (`zoo` lists them). Fractional transfer takes several: each has targets of its own in
+    the population."""
     source_member: int = 0
     """Which member of each source's population."""
     omega: tuple[float, ...] = ()

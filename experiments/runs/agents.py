@@ -16,6 +16,7 @@ import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from experiments.methods.meta_modules import meta_dynamics, meta_head
+from experiments.runs import exported
 from experiments.runs.spec import RunSpec, action_size, read_spec
 from transfer.recipes import fractional_transfer, meta_model, universal_autoencoder
 
@@ -88,8 +89,8 @@ class Source:
     """A trained agent that knowledge is taken from.
 
     Attributes:
-      directory: its results folder.
-      spec: what that run is.
+      directory: its results folder, or its file of weights.
+      spec: what its run is.
       params: the parameters of one member.
     """
 
@@ -98,13 +99,25 @@ class Source:
     params: dict[str, Any]
 
 
-def load_source(directory: str | Path, member: int = 0) -> Source:
-    """The agent of one member, from its run's newest checkpoint.
+def load_source(name: str | Path, member: int = 0, base: str | Path = "") -> Source:
+    """A trained agent: one member of a run, from its newest checkpoint, or an exported one.
+
+    Args:
+      name: a results folder, a .safetensors file with its card, or "zoo:NAME".
+      member: which of the run's population.
+      base: the folder that relative paths start from; by default the working directory.
 
     Raises:
-      ValueError: the folder holds no run, no checkpoint, or no such member.
+      ValueError: there is no run, no checkpoint, no such member, or no sound file.
     """
-    directory = Path(directory)
+    if exported.is_exported(name):
+        if member:
+            raise ValueError(f"{name} holds one agent, member {member} was asked for")
+        params = exported.read_params(name, base)
+        return Source(
+            exported.weights_path(name, base), exported.read_card(name, base).spec, params
+        )
+    directory = Path(base) / name
     spec = read_spec(directory)
     count = len(spec.members)
     if not 0 <= member < count:

@@ -52,8 +52,8 @@ def load_sources(spec: RunSpec, base: str | Path = "") -> Sources:
       ValueError: a folder holds no run or no checkpoint; sizes differ; a stored model was not
         trained on what the target keeps frozen, or is no plain model.
     """
-    agents = tuple(load_source(Path(base) / path, spec.source_member) for path in spec.sources)
-    stored = tuple(load_source(Path(base) / path) for path in spec.reward_sources)
+    agents = tuple(load_source(path, spec.source_member, base) for path in spec.sources)
+    stored = tuple(load_source(path, base=base) for path in spec.reward_sources)
     for one in (*agents, *stored):
         check_source(one, spec)
     for one in stored:
