@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_jax.files import read_json
-from experiments.reports.page import STYLE
+from experiments.reports import page
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
 from experiments.thesis.published import PATH, classification, records, returns
@@ -206,7 +206,9 @@ def test_each_contradiction_says_what_where_and_what_is_done():
         assert place.lower() in text.lower()
 
 
-@pytest.mark.parametrize("path", [PATH, STYLE])
+@pytest.mark.parametrize(
+    "path", [PATH, *(Path(page.__file__).with_name(name) for name in ("page.css", "page.html.j2"))]
+)
 def test_what_the_report_reads_is_packaged(path):
     root = Path(__file__).parent.parent
     settings = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]

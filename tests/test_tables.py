@@ -11,8 +11,9 @@ import envs
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from experiments.__main__ import main
-from experiments.cli import thesis
-from experiments.reports.outcomes import read_classification, read_outcomes
+from experiments.cli import reports, thesis
+from experiments.reports.classification import read_classification
+from experiments.reports.outcomes import read_outcomes
 from experiments.runs.folder import folders, latents_folder
 from experiments.thesis import grid, latent_tables
 from experiments.thesis.graph import plan_runs
@@ -46,7 +47,7 @@ def root(demo):
 def written(monkeypatch):
     """The tables and figures that were to be written, which here is only noted."""
     entries = []
-    monkeypatch.setattr(thesis, "_write", lambda some, *_: entries.extend(some))
+    monkeypatch.setattr(reports, "write_reports", lambda some, *_: entries.extend(some))
     return entries
 
 

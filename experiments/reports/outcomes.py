@@ -208,14 +208,15 @@ def seeds_on_disk(
             continue  # `read_outcomes` warns of it
         if any(task.partition("/")[0] == backend for task in spec.tasks):
             found |= set(spec.seeds)
-    ordered = sorted(found)
-    if not asked and ordered:
-        held, entries = folders(root), tuple(entries)
+    ordered, held, entries = sorted(found), folders(root), tuple(entries)
 
-        def there(source: int) -> int:
-            seeds = (source, *(seed for seed in ordered if seed != source))
-            cells = {cell for entry in entries for cell in shown(entry, seeds)}
-            return sum(cell.name in held for cell in cells)
+    def there(source: int) -> set[Cell]:
+        seeds = (source, *(seed for seed in ordered if seed != source))
+        cells = {cell for entry in entries for cell in shown(entry, seeds)}
+        return {cell for cell in cells if cell.name in held}
 
-        asked = (max(ordered, key=there),)
-    return (*asked[:1], *(seed for seed in ordered if seed not in asked[:1]))
+    if not ordered:
+        return ()
+    source = asked[0] if asked else max(ordered, key=lambda seed: len(there(seed)))
+    others = {cell.seed for cell in there(source)} | set(asked)
+    return (source, *sorted(others - {source}))
