@@ -10,7 +10,7 @@ from dreamer_jax.files import write_json_atomically
 from dreamer_jax.schedule import Schedule
 from experiments.runs.spec import RunSpec
 from experiments.thesis import grid
-from experiments.thesis.graph import task_name
+from experiments.thesis.populations import task_name
 
 VERSIONS = {"python": "3.11.7", "jax": "0.10.2", "backend": "cpu"}
 

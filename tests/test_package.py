@@ -15,8 +15,6 @@ import yaml
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("dreamer_jax", "transfer", "envs", "experiments")
 DEPENDENCIES = {"brax", "mujoco", "pybullet", "pybullet_envs_gymnasium"}
-# Results that were made are for readers of the repository.
-LEFT_OUT = ("experiments/results/",)
 
 IMPORT_ALL = """
 import importlib, importlib.resources, pkgutil, sys
@@ -50,7 +48,7 @@ def package_files():
     """All files in the packages' folders, by their paths in the repository."""
     paths = (path for package in PACKAGES for path in (ROOT / package).rglob("*"))
     files = (path.relative_to(ROOT).as_posix() for path in paths if path.is_file())
-    return {name for name in files if "__pycache__" not in name and not name.startswith(LEFT_OUT)}
+    return {name for name in files if "__pycache__" not in name}
 
 
 @pytest.fixture(scope="module")

@@ -7,20 +7,25 @@ import pytest
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from experiments.__main__ import main
+from experiments.methods.fractional import FractionalTransfer
+from experiments.methods.scratch import Scratch
 from experiments.reports import summary, tidy
 from experiments.reports.levels import draw_levels
 from experiments.reports.outcomes import curves, read_run
 from experiments.runs.spec import RunSpec
+
+SCRATCH = Scratch()
+TRANSFER = FractionalTransfer(sources=("source",), omegas=(0.0, 0.2), baseline=True)
 
 
 @pytest.fixture
 def folder(tmp_path):
     """Writes a run whose every evaluation of a task gives that task's return."""
 
-    def make(name, returns, steps=(40, 80), **settings):
+    def make(name, returns, method=SCRATCH, steps=(40, 80)):
         directory = tmp_path / name
         directory.mkdir(parents=True)
-        spec = RunSpec(tuple(returns), (0, 1), preset("debug"), **settings)
+        spec = RunSpec(tuple(returns), (0, 1), preset("debug"), method)
         write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
         rows = [
             {"kind": "evaluation", "member": number, "seed": member.seed, "label": member.label}
@@ -56,9 +61,7 @@ def test_one_task_on_two_simulators_shares_a_panel(folder):
 
 def test_curves_are_told_apart_by_folder_label_and_simulator(folder):
     both = folder("a/run", {"bullet/hopper": 0.0, "brax/hopper": 0.0, "brax/ant": 0.0})
-    targets = folder(
-        "b/run", {"brax/ant": 0.0}, sources=("source",), omegas=(0.0, 0.2), baseline=True
-    )
+    targets = folder("b/run", {"brax/ant": 0.0}, TRANSFER)
     a, b = map(str, (both, targets))
     assert texts(summary.compared_panels(read(both, targets))) == {
         "Hopper": [f"{a}, bullet/hopper", f"{a}, brax/hopper"],
@@ -67,7 +70,7 @@ def test_curves_are_told_apart_by_folder_label_and_simulator(folder):
 
 
 def test_a_folders_baseline_is_dashed_beside_its_transfers(folder):
-    targets = folder("run", {"brax/ant": 0.0}, sources=("s",), omegas=(0.0, 0.2), baseline=True)
+    targets = folder("run", {"brax/ant": 0.0}, TRANSFER)
     (panel,) = summary.panels(*read(targets))
     assert [curve.text for curve in panel.curves] == ["ω = 0", "ω = 0.2", "baseline"]
     assert [curve.style.get("linestyle") for curve in panel.curves] == [None, None, "--"]
@@ -92,7 +95,7 @@ def test_final_returns_are_the_last_planned_where_none_lies_in_the_last_tenth(fo
         ((30, 60, 90), "cut", None),
         ((30, 60, 150), "cut", (150.0, 0.0)),
     ):
-        made = folder(f"run {steps}", {"bullet/hopper": 0.0}, steps)
+        made = folder(f"run {steps}", {"bullet/hopper": 0.0}, steps=steps)
         (run,) = read(rewritten(made, numbered))
         assert {outcome.state for outcome in run.outcomes} == {state}
         assert summary.summarise(run)[0].final == final
@@ -140,9 +143,7 @@ def test_metrics_of_another_run_are_refused(folder):
 
 def test_all_evaluations_are_a_table_that_pandas_reads(folder, tmp_path):
     pandas = pytest.importorskip("pandas")
-    targets = folder(
-        "targets", {"brax/ant": 5.0}, sources=("source",), omegas=(0.0, 0.2), baseline=True
-    )
+    targets = folder("targets", {"brax/ant": 5.0}, TRANSFER)
     both = folder("both", {"bullet/hopper": 3.0, "bullet/ant": 4.0})
     path = tidy.write_evaluations(read(targets, both), tmp_path / "new" / "results.csv")
     frame = pandas.read_csv(path)

@@ -102,7 +102,7 @@ def test_what_was_transferred_is_written_leaf_by_leaf(root):
 
 def test_runs_say_where_their_sources_are_from_the_folder_of_all(root):
     header = read_json(root / TARGETS / "run.json")
-    assert header["spec"]["sources"] == [SOURCE]
+    assert header["spec"]["method"]["sources"] == [SOURCE]
     assert header["revision"] and header["versions"]["jax"]
     assert len(read_json(root / TARGETS / "cells.json")) == 8
 
@@ -126,8 +126,10 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, 
     # Made in a moment: what is trained here is the population of targets.
     for seed, run in enumerate(sources):
         spec = run.spec
-        if spec.sources:
-            spec = dataclasses.replace(spec, sources=tuple(str(root / x) for x in spec.sources))
+        if spec.method.sources:
+            sources = tuple(str(root / name) for name in spec.method.sources)
+            method = dataclasses.replace(spec.method, sources=sources)
+            spec = dataclasses.replace(spec, method=method)
         finish(run, root)
         write_run(root / run.name, spec, seed, keep=True)
     sweep = thesis.Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)

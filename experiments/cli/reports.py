@@ -11,7 +11,8 @@ from pathlib import Path
 import tyro
 
 from experiments.cli.exits import UsageError, usage_errors
-from experiments.cli.thesis import Preset, chosen
+from experiments.cli.options import DEFAULT_PRESET, Preset
+from experiments.cli.thesis import chosen
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, Table
 
@@ -46,7 +47,7 @@ class Seeds:
 
     names: tyro.conf.Positional[tuple[str, ...]]
     """Numbers of tables of returns (1 to 12, 16, 17)."""
-    preset: Preset = "cpu"
+    preset: Preset = DEFAULT_PRESET
     """Whose results."""
     group: int = 5
     """Seeds between two looks."""

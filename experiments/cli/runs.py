@@ -3,23 +3,36 @@
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
+import dataclasses
+import functools
+import inspect
+import typing
 from dataclasses import dataclass
+from dataclasses import fields as _fields
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from dreamer_jax.config import Config
+from experiments import methods
 from experiments.cli.exits import STOPPED, UsageError, usage_errors
+from experiments.cli.options import (
+    DEFAULT_PRESET,
+    Base,
+    ConfigFile,
+    Preset,
+    make_method,
+    method_defaults,
+    method_groups,
+    method_summary,
+    sequence,
+)
 
 
 @dataclass(frozen=True)
-class Train:
-    """Train a population of agents, from scratch or from a source, or resume one.
-
-    Several tasks make one multi-task agent. With --source and --omega the population holds one
-    target per fraction and seed; with --method uae or meta, one on the source's frozen encoder.
-    """
+class Run:
+    """What to train, and where."""
 
     task: tuple[str, ...]
     """Names of the tasks, such as bullet/hopper (an unknown name lists them all), or gymnasium/ID
@@ -28,47 +41,71 @@ class Train:
     """The results folder."""
     seeds: tuple[int, ...] = (0,)
     """One agent per seed; all train as one population."""
-    preset: Literal["thesis", "cpu", "demo", "debug"] = "cpu"
+    preset: Preset = DEFAULT_PRESET
     """Settings to start from; each can be overridden by its name below."""
-    source: tuple[Path, ...] = ()
-    """The agent to transfer from: a results folder, a .safetensors file that `export` wrote, or
-    zoo:NAME (`zoo` lists them). Fractional transfer takes several: each has targets of its own in
-    the population."""
-    source_member: int = 0
-    """Which member of each source's population."""
-    omega: tuple[float, ...] = ()
-    """Fractions of the source's last reward and value layers to add (0 to 1)."""
-    baseline: bool = False
-    """Add agents from scratch, one per seed, to the transfer targets."""
-    method: Literal["fractional", "uae", "meta"] = "fractional"
-    """How the source is used: fractional transfer; as a universal autoencoder with a frozen
-    encoder; or as that and with meta-models over the models of further agents."""
-    fractions: tuple[str, ...] = ("reward", "value", "termination")
-    """fractional: the components whose last layer a fraction is transferred of (any of reward,
-    value, termination, dynamics, actor); the last layers of the other heads are drawn anew."""
-    dynamics: Literal["fresh", "copied", "frozen"] = "fresh"
-    """uae and meta: the latent dynamics, drawn anew, or copied from the source to train on, or
-    copied and frozen but for the kernel of the action."""
-    reward_sources: tuple[Path, ...] = ()
-    """meta: results folders of agents made by --method uae from the same source, whose models the
-    meta-model reads."""
-    reward_counts: tuple[int, ...] = ()
-    """meta: how many of these a target reads, the first ones; one target per number and seed."""
-    meta: tuple[str, ...] = ("reward",)
-    """meta: the components that are meta-models (any of reward, value, dynamics)."""
-    meta_layers: int = 1
-    """meta: hidden layers of a meta-model of reward or value."""
-    switching: bool = False
-    """meta: recognise the task of each latent state, and use the stored reward model of a task
-    that is known and the meta-model for a novel one (needs --dynamics frozen)."""
-    threshold: float | None = None
-    """meta, switching: the distance beyond which a task is novel; by default suggested by the
-    samples of the known tasks."""
+    file: ConfigFile = None
+    """A YAML or JSON file of settings, written as a run's own are (run.json), or a part of them:
+    over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
-    config: tyro.conf.OmitArgPrefixes[Config] = Config()
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a population of agents, from scratch or from a source, or resume one.
+
+    Several tasks make one multi-task agent. With --source and --omega the population holds one
+    target per fraction and seed; other methods transfer in other ways.
+    """
+
+    run: Run
+    method: str | None
+    transfer: tuple[Any, ...]
+    config: Config
+
+
+@functools.cache
+def train_options() -> type:
+    """The options of `train`: a group for the run, one for the method, those of the settings of
+    methods, and those of the agent's settings."""
+    choices = Literal[tuple(methods.known())]  # type: ignore[valid-type]
+    named = Annotated[choices | None, tyro.conf.arg(help=method_summary())]
+    chooses = dataclasses.make_dataclass(
+        "transfer", [("method", named, dataclasses.field(default=None))], frozen=True
+    )
+    chooses.__doc__ = "How knowledge is transferred from a trained agent, if at all."
+    groups = {"run": Run, "transfer": chooses, **method_groups(), "config": Config}
+    fields = [(name, tyro.conf.OmitArgPrefixes[kind]) for name, kind in groups.items()]
+    found = dataclasses.make_dataclass("TrainOptions", fields, frozen=True)
+    found.__doc__ = inspect.getdoc(Train)
+    return found
+
+
+def train_defaults(base: Base) -> Any:
+    """Defaults of `train_options`, from a preset and perhaps a file of settings.
+
+    Raises:
+      ValueError: the file names a setting that no method has.
+    """
+    options, values = train_options(), base.values
+    kinds = {field.name: typing.get_type_hints(options)[field.name] for field in _fields(options)}
+    name, groups = method_defaults(values)
+    run = Run(
+        task=sequence(values, "tasks", tyro.MISSING),
+        out=tyro.MISSING,
+        seeds=sequence(values, "seeds", (0,)),
+        preset=base.preset,
+        file=base.file,
+    )
+    return options(run=run, transfer=kinds["transfer"](name), **groups, config=base.config)
+
+
+def train_command(options: Any) -> Train:
+    """The command that options of `train_options` make."""
+    groups = tuple(getattr(options, name) for name in method_groups())
+    return Train(options.run, options.transfer.method, groups, options.config)
 
 
 @dataclass(frozen=True)
@@ -129,35 +166,22 @@ class Classify:
 def train(command: Train) -> int:
     """Trains a population."""
     from experiments.cli.reports import Report, report
-    from experiments.runs.run import carry_out, make_run
     from experiments.runs.spec import RunSpec
 
+    run = command.run
     with usage_errors():
-        spec = RunSpec(
-            tasks=command.task,
-            seeds=command.seeds,
-            config=command.config,
-            sources=tuple(map(str, command.source)),
-            source_member=command.source_member,
-            omegas=command.omega,
-            baseline=command.baseline,
-            method=command.method,
-            fractions=command.fractions,
-            dynamics=command.dynamics,
-            reward_sources=tuple(map(str, command.reward_sources)),
-            reward_counts=command.reward_counts,
-            meta=command.meta,
-            meta_layers=command.meta_layers,
-            switching=command.switching,
-            threshold=command.threshold,
-        )
-        run = make_run(spec, command.out, resume=command.resume, workers=command.workers)
-    if spec.sources:
-        print((command.out / "transfer.txt").read_text())
-    if carry_out(run) == "stopped":
-        print(f"stopped and saved in {command.out}: the same command with --resume continues")
+        method = make_method(command.method, command.transfer)
+        spec = RunSpec(run.task, run.seeds, command.config, method)
+    from experiments.runs.run import carry_out, make_run
+
+    with usage_errors():
+        begun = make_run(spec, run.out, resume=run.resume, workers=run.workers)
+    if spec.method.needs:
+        print((run.out / "transfer.txt").read_text())
+    if carry_out(begun) == "stopped":
+        print(f"stopped and saved in {run.out}: the same command with --resume continues")
         return STOPPED
-    return report(Report((command.out,)))
+    return report(Report((run.out,)))
 
 
 def evaluate(command: Evaluate) -> int:

@@ -14,17 +14,16 @@ import tyro
 
 from dreamer_jax import config as configs
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
+from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, Table
-
-Preset = Literal["thesis", "cpu", "demo", "debug"]
 
 
 @dataclass(frozen=True)
 class Sweep:
     """What all runs of a sweep share."""
 
-    preset: Preset = "cpu"
+    preset: Preset = DEFAULT_PRESET
     """Settings of all agents, each of which can be overridden by its name below; results are in a
     folder of that name."""
     seeds: tuple[int, ...] = grid.SEEDS
@@ -39,6 +38,9 @@ class Sweep:
     """The folder of all results."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
+    file: ConfigFile = None
+    """A YAML or JSON file of settings (config, and perhaps seeds), written as a run's own are
+    (run.json): over the preset's, under those given by name."""
     config: tyro.conf.OmitArgPrefixes[configs.Config] = configs.preset("cpu")
 
     @property
@@ -94,6 +96,29 @@ class Demo:
     """debug runs the same in seconds."""
     workers: int | None = None
     """Simulator processes; by default one per core."""
+
+
+def _sweep(base: Base) -> Sweep:
+    """The defaults of a sweep."""
+    if strange := sorted(set(base.values) - {"preset", "seeds", "config"}):
+        raise ValueError(f"{base.file}: the settings {', '.join(strange)} are those of a table")
+    seeds = sequence(base.values, "seeds", grid.SEEDS)
+    return Sweep(preset=base.preset, file=base.file, seeds=seeds, config=base.config)
+
+
+def table_defaults(base: Base) -> Tables:
+    """Defaults of `table`."""
+    return Tables(names=tyro.MISSING, sweep=_sweep(base))
+
+
+def figure_defaults(base: Base) -> Figures:
+    """Defaults of `figure`."""
+    return Figures(names=tyro.MISSING, sweep=_sweep(base))
+
+
+def plan_defaults(base: Base) -> Plan:
+    """Defaults of `plan`."""
+    return Plan(sweep=_sweep(base))
 
 
 def chosen(
@@ -267,7 +292,7 @@ def demo(command: Demo) -> int:
 
     sweep = Sweep(
         command.preset,
-        (0, 1),
+        seeds=(0, 1),
         results=command.results,
         workers=command.workers,
         config=configs.preset(command.preset),

@@ -11,8 +11,8 @@ from experiments.reports import curves
 from experiments.reports.curves import FORMATS
 from experiments.reports.outcomes import Outcome
 from experiments.thesis import grid
-from experiments.thesis.graph import task_name
 from experiments.thesis.grid import Cell, Figure
+from experiments.thesis.populations import task_name
 
 TRANSFER, BASELINE = "tab:blue", "tab:green"
 """The thesis's colours."""

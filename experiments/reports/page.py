@@ -31,13 +31,13 @@ from experiments.reports.sheet import (
     classification_sheet,
     interval,
     returns_sheet,
+    settings_changed,
     size_note,
 )
 from experiments.reports.verdicts import LEAST_SEEDS
 from experiments.runs.folder import CELLS, latents_folder
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
-from experiments.thesis.graph import changed_settings
 from experiments.thesis.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
 
 LARGEST_VIDEOS = 16 * 2**20
@@ -154,7 +154,7 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
             "evaluations were made."
         ),
         "size": size and size[0].upper() + size[1:],
-        "changed": changed_settings(root),
+        "changed": settings_changed(root),
         "failed": [cell.name for cell, one in outcomes.items() if one.state == "failed"],
         "findings": [_finding(one) for one in findings(returns, outcomes, seeds)],
         "least_seeds": LEAST_SEEDS,

@@ -85,12 +85,17 @@ MOST_NAMED = 3
 
 def size_note(root: Path) -> str | None:
     """A plain word on results that are not of the thesis's sizes, and on settings overridden."""
-    changed = changed_settings(root)
+    changed = settings_changed(root)
     if root.name == "thesis" and not changed:
         return None
     if len(changed) > MOST_NAMED:
-        changed = (f"{len(changed)} settings changed",)
+        changed = [f"{len(changed)} settings changed"]
     return f"preset {', '.join([root.name, *changed])}: not comparable in size"
+
+
+def settings_changed(root: Path) -> list[str]:
+    """Settings that are not those of the preset, such as "environment_steps 30000"."""
+    return [f"{one.path.rpartition('.')[2]} {one.one}" for one in changed_settings(root)]
 
 
 def _title(table: Table) -> str:

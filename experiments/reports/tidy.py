@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.methods.scratch import Scratch
 from experiments.reports.outcomes import Run
 from experiments.runs.folder import CELLS, read_cells
 from experiments.runs.spec import BASELINE
@@ -44,13 +45,13 @@ def rows(runs: Iterable[Run]) -> Iterator[dict[str, Any]]:
             number = row["member"]
             member, outcome = run.spec.members[number], run.outcomes[number]
             scratch = member.label == BASELINE
-            source = member.tags.get("source", " ".join(map(str, run.spec.sources)))
+            source = member.tags.get("source", " ".join(run.spec.method.sources))
             known = {
                 "folder": run.folder.resolve().name,
                 "cell": cells[number] if number < len(cells) else None,
                 "seed": member.seed,
                 "label": member.label,
-                "method": "scratch" if scratch else run.spec.method,
+                "method": Scratch.NAME if scratch else run.spec.method.NAME,
                 "from": None if scratch else source,
                 "state": outcome.state,
             }

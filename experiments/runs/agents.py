@@ -15,24 +15,8 @@ import envs
 import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
-from experiments.methods.meta_modules import meta_dynamics, meta_head
 from experiments.runs import exported
 from experiments.runs.spec import RunSpec, action_size, read_spec
-from transfer.recipes import fractional_transfer, meta_model, universal_autoencoder
-
-KNOWN_SAMPLES = 100
-"""Latent states of each task that a switching agent recognises it by (section 4.3.2)."""
-
-
-def plan(spec: RunSpec) -> transfer.Plan | None:
-    """What a run's method does to each leaf of a fresh agent; none for one from scratch."""
-    if not spec.sources:
-        return None
-    if spec.method == "fractional":
-        return fractional_transfer(fractions=spec.fractions)
-    if spec.method == "uae":
-        return universal_autoencoder(spec.dynamics)
-    return meta_model(spec.dynamics, components=spec.meta, switching=spec.switching)
 
 
 @functools.cache
@@ -40,9 +24,9 @@ def make_agent(spec: RunSpec) -> Agent:
     """The functions of a run's agents. What its method freezes is frozen in them."""
     discrete = envs.specs(spec.tasks)[0].discrete
     agent = Agent(spec.config, action_size(spec.tasks), discrete)
-    if spec.method == "meta":
-        agent = dataclasses.replace(agent, modules=_meta_modules(agent, spec))
-    if (chosen := plan(spec)) is None:
+    if modules := spec.method.modules(agent):
+        agent = dataclasses.replace(agent, modules=modules)
+    if (chosen := spec.method.plan()) is None:
         return agent
     fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
     kept = {
@@ -53,23 +37,6 @@ def make_agent(spec: RunSpec) -> Agent:
     learning = spec.config.learning
     learning = dataclasses.replace(learning, frozen=(*learning.frozen, *sorted(kept)))
     return dataclasses.replace(agent, config=dataclasses.replace(spec.config, learning=learning))
-
-
-def _meta_modules(agent: Agent, spec: RunSpec):
-    """The modules of the components that are meta-models, by name."""
-    modules = {}
-    for name in spec.meta:
-        if name == "dynamics":
-            modules[name] = meta_dynamics(agent.dynamics, places=spec.places)
-            continue
-        switching = spec.switching and name == "reward"
-        modules[name] = meta_head(
-            agent.heads[name],
-            layers=spec.meta_layers,
-            places=spec.places,
-            samples=KNOWN_SAMPLES * len(spec.reward_sources) if switching else 0,
-        )
-    return tuple(modules.items())
 
 
 def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:

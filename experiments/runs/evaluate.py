@@ -1,6 +1,6 @@
 """Evaluation of trained populations: returns, videos of episodes, and open-loop predictions.
 
-Axis letters: P population member, K task, T records, L frames of a prediction.
+Axis letters: P population member, K task, T records of a phase, L frames of a prediction.
 """
 
 import re
@@ -72,23 +72,10 @@ def evaluate(
     """
     directory, spec, params = agents
     agent, env = make_agent(spec), make_env(spec, workers)
-    seeds = jnp.array([member.seed for member in spec.members], jnp.int32)
     rows = []
     try:
         for number in range(count):
-            records = collect(
-                agent,
-                env,
-                params,
-                seeds,
-                jnp.zeros_like(seeds),
-                jnp.int32(FIRST_PHASE + number),
-                tasks=len(spec.tasks),
-                ticks=spec.config.schedule.phase_ticks,
-                mode="evaluate",
-            )
-            records = Records(*(np.asarray(x) for x in records))
-            env.check()
+            records = _played(agent, env, agents, number)
             new = _rows(spec, records, number)
             rows += new
             report(number + 1, float(np.mean([row["return"] for row in new])))
@@ -97,6 +84,43 @@ def evaluate(
     finally:
         env.close()
     return rows
+
+
+def play(agents: Agents, number: int = 0, *, workers: int | None = None) -> Records:
+    """One phase of every member on every task: the mode, without noise.
+
+    Args:
+      agents: the population.
+      number: of the phase; each has starts of its own, those of `evaluate`'s episodes.
+      workers: simulator processes; by default one per core.
+
+    Returns:
+      NumPy leaves [P, K, T, ...].
+    """
+    env = make_env(agents.spec, workers)
+    try:
+        return _played(make_agent(agents.spec), env, agents, number)
+    finally:
+        env.close()
+
+
+def _played(agent: Agent, env, agents: Agents, number: int) -> Records:
+    spec = agents.spec
+    seeds = jnp.array([member.seed for member in spec.members], jnp.int32)
+    records = collect(
+        agent,
+        env,
+        agents.params,
+        seeds,
+        jnp.zeros_like(seeds),
+        jnp.int32(FIRST_PHASE + number),
+        tasks=len(spec.tasks),
+        ticks=spec.config.schedule.phase_ticks,
+        mode="evaluate",
+    )
+    records = Records(*(np.asarray(x) for x in records))
+    env.check()
+    return records
 
 
 def _rows(spec: RunSpec, records: Records, number: int) -> list[dict[str, Any]]:

@@ -152,6 +152,11 @@ def gather(
     return [Latents(*(np.concatenate(x) for x in zip(*parts, strict=True))) for parts in found]
 
 
+def own_latents(source: Source, samples: int, *, workers: int | None = None) -> list[Latents]:
+    """At least so many latent states of an agent on each of its own tasks, by random actions."""
+    return gather(source, source.spec.tasks, phases_for(source, samples), workers=workers)
+
+
 def _check_sizes(
     source: Source, actor: Source, agent: Agent, acting: Agent, tasks: Sequence[str]
 ) -> None:

@@ -79,7 +79,7 @@ def make_run(
         different = read_spec(directory).differences(spec)
         if different:
             raise ValueError(
-                f"{directory} holds another run (there / here: {'; '.join(different)}): "
+                f"{directory} holds another run (there / here: {'; '.join(map(str, different))}): "
                 "give the same settings, or choose another folder"
             )
         if not resume:
@@ -87,7 +87,7 @@ def make_run(
                 f"{directory} already holds this run: add --resume, or choose another folder"
             )
     state, report = None, None
-    if spec.sources and Checkpointer(directory / "checkpoints").latest() is None:
+    if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
         state, report = transferred_members(spec, load_sources(spec, base), workers=workers)
     agent = make_agent(spec)
     env = make_env(spec, workers=workers)

@@ -4,21 +4,19 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import envs
 from dreamer_jax import config as configs
-from dreamer_jax.config import Config
+from dreamer_jax.config import Config, Difference
 from dreamer_jax.files import read_json
-from dreamer_jax.training import Member
-from transfer.recipes import fractional_transfer, meta_model
+from experiments import methods
+from experiments.methods.base import BASELINE as BASELINE
+from experiments.methods.base import Method, require
+from experiments.methods.scratch import Scratch
 
-BASELINE = "baseline"
-FRACTIONS = ("reward", "value", "termination")
-PLACES = 4
-"""Places for stored models in a meta-model; targets with fewer share one shape (section 4.4)."""
-
-Method = Literal["fractional", "uae", "meta"]
+if TYPE_CHECKING:
+    from dreamer_jax.training import Member
 
 
 @dataclass(frozen=True)
@@ -27,201 +25,91 @@ class RunSpec:
 
     Attributes:
       tasks: names of the K tasks; several make a multi-task agent.
-      seeds: one member (or one for each omega) per seed.
+      seeds: of the members; a method may make several members of each.
       config: the settings.
-      sources: folders of the runs whose agents are transferred; none for training from scratch.
-        Fractional transfer takes several: each has targets of its own in one population.
-      source_member: which member of each source's population.
-      omegas: fractions of equation 19, one target per source, fraction and seed.
-      baseline: whether agents from scratch, one per seed, join the transfer targets.
-      method: "fractional" (section 3.2), "uae" (the universal autoencoder, 3.3.1) or "meta"
-        (meta-models on it, 3.3.2); not used from scratch.
-      fractions: the components whose last layer a fraction is transferred of.
-      dynamics: of a target on a universal autoencoder, see `transfer.recipes`.
-      reward_sources: folders of the runs, each on the same autoencoder, whose models a
-        meta-model reads.
-      reward_counts: numbers of them, one target per number and seed; all of them by default.
-      meta: the components that are meta-models.
-      meta_layers: hidden layers of a meta-model of reward or value.
-      switching: whether the stored reward model of a known task takes the meta-model's place.
-      threshold: ξ for switching; by default suggested by the samples.
+      method: how the agents begin and what of them is trained, see `experiments.methods`. Folders
+        that it names may be relative.
     """
 
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     config: Config
-    sources: tuple[str, ...] = ()
-    source_member: int = 0
-    omegas: tuple[float, ...] = ()
-    baseline: bool = False
-    method: Method = "fractional"
-    fractions: tuple[str, ...] = FRACTIONS
-    dynamics: Literal["fresh", "copied", "frozen"] = "fresh"
-    reward_sources: tuple[str, ...] = ()
-    reward_counts: tuple[int, ...] = ()
-    meta: tuple[str, ...] = ("reward",)
-    meta_layers: int = 1
-    switching: bool = False
-    threshold: float | None = None
+    method: Method = Scratch()
 
     def __post_init__(self):
         choices = ", ".join([*envs.task_names(), "gymnasium/ID"])
-        _require(self.tasks, f"no task given: choose from {choices}")
+        require(self.tasks, f"no task given: choose from {choices}")
         envs.specs(self.tasks)
-        _require(len(set(self.tasks)) == len(self.tasks), f"a task is named twice: {self.tasks}")
-        _require(self.seeds, "no seed given")
-        _require(len(set(self.seeds)) == len(self.seeds), f"a seed is named twice: {self.seeds}")
-        _require(
+        require(len(set(self.tasks)) == len(self.tasks), f"a task is named twice: {self.tasks}")
+        require(self.seeds, "no seed given")
+        require(len(set(self.seeds)) == len(self.seeds), f"a seed is named twice: {self.seeds}")
+        require(
             all(0 <= seed < 2**31 for seed in self.seeds),
             f"seeds {self.seeds} must lie in [0, 2^31)",
         )
-        _require(
-            len(set(self.sources)) == len(self.sources), f"a source is named twice: {self.sources}"
-        )
-        self._check_method()
-        if self.method == "fractional":
-            self._check_fractional()
-        else:
-            self._check_on_autoencoder()
-
-    def _check_method(self) -> None:
-        """Settings that belong to other methods than the run's are left alone."""
-        owners = {
-            "omegas": ("--omega", ("fractional",)),
-            "baseline": ("--baseline", ("fractional",)),
-            "fractions": ("--fractions", ("fractional",)),
-            "dynamics": ("--dynamics", ("uae", "meta")),
-            "reward_sources": ("--reward-sources", ("meta",)),
-            "reward_counts": ("--reward-counts", ("meta",)),
-            "meta": ("--meta", ("meta",)),
-            "meta_layers": ("--meta-layers", ("meta",)),
-            "switching": ("--switching", ("meta",)),
-            "threshold": ("--threshold", ("meta",)),
-        }
-        defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
-        for name, (option, methods) in owners.items():
-            _require(
-                self.method in methods or getattr(self, name) == defaults[name],
-                f"{option} belongs to --method {' or '.join(methods)}, and the method here is "
-                f"{self.method}",
-            )
-
-    def _check_fractional(self) -> None:
-        if not self.sources:
-            _require(not self.omegas, "--omega needs a source agent: add --source DIR")
-            return
-        _require(self.omegas, "--source needs the fractions to transfer: add --omega 0 0.2")
-        _require(
-            all(0 <= omega <= 1 for omega in self.omegas),
-            f"omega {self.omegas} must lie in [0, 1] (equation 19)",
-        )
-        fractional_transfer(fractions=self.fractions)
-
-    def _check_on_autoencoder(self) -> None:
-        _require(
-            len(self.sources) == 1,
-            f"--method {self.method} needs the agent whose autoencoder is used: add --source DIR, "
-            "one only",
-        )
-        if self.method == "uae":
-            return
-        meta_model(self.dynamics, components=self.meta, switching=self.switching)
-        count = len(self.reward_sources)
-        _require(
-            count,
-            "--method meta needs the agents whose models are stored: add --reward-sources DIR DIR",
-        )
-        _require(
-            all(1 <= chosen <= count for chosen in self.reward_counts),
-            f"--reward-counts {self.reward_counts} must lie in [1, {count}], the number of "
-            "--reward-sources",
-        )
-        _require(
-            len(set(self.reward_counts)) == len(self.reward_counts),
-            f"a number of reward sources is named twice: {self.reward_counts}",
-        )
-        _require(self.meta_layers >= 0, f"meta_layers is {self.meta_layers}, must not be negative")
-        _require(
-            self.threshold is None or self.switching,
-            "--threshold is that of --switching: add it, or leave both out",
-        )
-        if self.switching:
-            _require(
-                self.dynamics == "frozen",
-                "--switching uses stored reward models as they are, and they read the latent "
-                "states of the dynamics they were trained with: add --dynamics frozen, here and "
-                "in the runs of the reward sources",
-            )
-            _require(
-                not self.reward_counts,
-                "--switching uses all reward sources: leave out --reward-counts",
-            )
 
     @property
-    def places(self) -> int:
-        """N of a meta-model, those without a stored model included."""
-        return max(PLACES, len(self.reward_sources))
-
-    @property
-    def members(self) -> tuple[Member, ...]:
-        """The population: seeds within fractions within sources, or within numbers of stored
-        models; then the baseline."""
-        if not self.sources:
-            return tuple(Member(seed, BASELINE) for seed in self.seeds)
-        if self.method == "uae":
-            return tuple(Member(seed, "uae", {"dynamics": self.dynamics}) for seed in self.seeds)
-        if self.method == "meta":
-            return tuple(
-                Member(seed, f"sources={count}", {"sources": count})
-                for count in self.reward_counts or (len(self.reward_sources),)
-                for seed in self.seeds
-            )
-        targets = tuple(
-            Member(seed, f"omega={omega:g}{ending}", {"omega": omega} | tags)
-            for ending, tags in self._source_marks()
-            for omega in self.omegas
-            for seed in self.seeds
-        )
-        scratch = tuple(Member(seed, BASELINE) for seed in self.seeds)
-        return targets + (scratch if self.baseline else ())
-
-    def _source_marks(self) -> list[tuple[str, dict[str, str]]]:
-        """What tells the targets of several sources apart: the end of their labels, and a tag."""
-        if len(self.sources) == 1:
-            return [("", {})]
-        names = [Path(source).name for source in self.sources]
-        if len(set(names)) < len(names):
-            names = list(self.sources)
-        return [(f" from {name}", {"source": name}) for name in names]
+    def members(self) -> "tuple[Member, ...]":
+        """The population: the method's targets, then the baseline."""
+        return self.method.members(self.seeds)
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON can hold it."""
-        return dataclasses.asdict(self)
+        method = {"name": self.method.NAME, **dataclasses.asdict(self.method)}
+        return {
+            "tasks": self.tasks,
+            "seeds": self.seeds,
+            "config": configs.to_dict(self.config),
+            "method": method,
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "RunSpec":
-        """From `to_dict`'s result, by way of JSON too."""
+        """From `to_dict`'s result, by way of JSON too, or from one in which the settings of all
+        methods stood beside the others.
+
+        Raises:
+          ValueError: a setting is unknown, or its value is refused.
+        """
+        values = dict(values)
+        method = values.pop("method", None)
+        if not isinstance(method, Mapping):
+            settings = {key: values.pop(key) for key in methods.options() if key in values}
+            # These named a method for agents from scratch, too.
+            name = method if settings.get("sources") else Scratch.NAME
+            method = {"name": name, **(settings if settings.get("sources") else {})}
         known = {field.name for field in dataclasses.fields(cls)}
-        _require(
-            set(values) <= known,
-            f"unknown settings of a run: {', '.join(sorted(set(values) - known))}. Another version "
-            "of this program wrote them: use that one, or train anew in another folder",
-        )
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**{**values, "config": configs.from_dict(values["config"])})
-
-    def differences(self, other: "RunSpec") -> list[str]:
-        """What differs between two, as "name: this / other"."""
-        names = [field.name for field in dataclasses.fields(self) if field.name != "config"]
-        pairs = [(name, getattr(self, name), getattr(other, name)) for name in names]
-        return [f"{name}: {one} / {two}" for name, one, two in pairs if one != two] + (
-            configs.differences(self.config, other.config)
+        if unknown := sorted(set(values) - known):
+            raise ValueError(
+                f"unknown settings of a run: {', '.join(unknown)}. Another version of this program "
+                "wrote them: use that one, or train anew in another folder"
+            )
+        settings = {key: _plain(value) for key, value in method.items() if key != "name"}
+        return cls(
+            tasks=_plain(values["tasks"]),
+            seeds=_plain(values["seeds"]),
+            config=configs.from_dict(values["config"]),
+            method=methods.make(method["name"], settings),
         )
 
+    def differences(self, other: "RunSpec") -> tuple[Difference, ...]:
+        """What differs between two; settings of methods go by their names."""
+        one, two = self._flat(), other._flat()
+        pairs = [Difference(name, one.get(name), two.get(name)) for name in {**one, **two}]
+        return (
+            *(pair for pair in pairs if pair.one != pair.other),
+            *configs.differences(self.config, other.config),
+        )
 
-def _require(condition, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
+    def _flat(self) -> dict[str, Any]:
+        """All but the configuration."""
+        method = dataclasses.asdict(self.method)
+        return {"tasks": self.tasks, "seeds": self.seeds, "method": self.method.NAME, **method}
+
+
+def _plain(value: Any) -> Any:
+    """JSON turns tuples into lists."""
+    return tuple(value) if isinstance(value, list) else value
 
 
 def read_spec(directory: str | Path) -> RunSpec:

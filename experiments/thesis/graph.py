@@ -1,32 +1,29 @@
-"""The graph of runs behind cells of the grid: what is done, what is missing, and in which order.
+"""The graph of runs behind cells of the grid: what is done, what is missing, and in which order."""
 
-Missing cells on one task, of one method, whose trees have one shape, are one run: a population.
-The targets of fractional transfer to a task (sources × fractions × seeds) and its baselines are
-one, as are the targets of meta-models (numbers of sources × seeds). Source agents are runs of
-their own. What is missing of a population that is partly done is split into products.
-"""
-
-import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import envs
 from dreamer_jax import config as configs
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
-from dreamer_jax.config import Config
+from dreamer_jax.config import Config, Difference
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Counters, Schedule
 from experiments.runs.folder import CELLS, begun, read_cells, run_folders
 from experiments.runs.spec import RunSpec, read_spec
-from experiments.thesis.grid import Backend, Cell
-
-MULTITASK_STEPS = 2
-"""Environment steps of an agent for several tasks, in those of one for one task (section 4.2.1)."""
+from experiments.thesis.grid import Cell
+from experiments.thesis.populations import (
+    MULTITASK_STEPS,
+    Population,
+    config_of,
+    new_populations,
+    of_length,
+)
+from experiments.thesis.populations import task_name as task_name
 
 # How members are mapped depends on the machine and changes no result but by rounding.
-_OF_THE_MACHINE = ("schedule.mapping:", "schedule.mapping_chunk:")
+_OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
 
 
 @dataclass(frozen=True)
@@ -52,35 +49,11 @@ class PlannedRun:
     problem: str = ""
 
 
-def task_name(backend: Backend, title: str) -> str:
-    """The name of a task of the grid, such as "bullet/hopper" for Hopper on bullet.
-
-    Raises:
-      ValueError: the backend has no such task; names the tasks there are.
-    """
-    names = envs.task_names()
-    for name in names:
-        if name.partition("/")[0] == backend and envs.spec(name).title == title:
-            return name
-    raise ValueError(f"there is no task {title} of {backend}, the tasks are {', '.join(names)}")
-
-
-def config_of(cell: Cell, config: Config) -> Config:
-    """A preset's settings as a cell has them: agents for several tasks take more steps."""
-    if len(cell.tasks) == 1:
-        return config
-    return _of_length(config, MULTITASK_STEPS * config.schedule.environment_steps)
-
-
-def _of_length(config: Config, environment_steps: int) -> Config:
-    schedule = dataclasses.replace(config.schedule, environment_steps=environment_steps)
-    return dataclasses.replace(config, schedule=schedule)
-
-
-def changed_settings(root: str | Path) -> tuple[str, ...]:
+def changed_settings(root: str | Path) -> tuple[Difference, ...]:
     """Settings of the runs under a root that are not those of the preset it is named after.
 
-    Such as "environment_steps 30000", which stands for agents for one task.
+    The length of agents for several tasks is told as that of agents for one. Each value is told
+    once; `one` is the runs', `other` the preset's.
     """
     root, found = Path(root), {}
     if root.name not in configs.PRESETS:
@@ -92,12 +65,15 @@ def changed_settings(root: str | Path) -> tuple[str, ...]:
             continue  # `read_outcomes` warns of it
         config = spec.config
         if len(spec.tasks) > 1:
-            config = _of_length(config, config.schedule.environment_steps // MULTITASK_STEPS)
-        for text in configs.differences(config, configs.preset(root.name)):
-            if not text.startswith(_OF_THE_MACHINE):
-                name, _, value = text.partition(" / ")[0].partition(": ")
-                found[f"{name.partition('.')[2]} {value}"] = None
+            config = of_length(config, config.schedule.environment_steps // MULTITASK_STEPS)
+        found |= dict.fromkeys(_of_results(config, configs.preset(root.name)))
     return tuple(found)
+
+
+def _of_results(one: Config, other: Config) -> tuple[Difference, ...]:
+    """Differences of what results depend on."""
+    pairs = configs.differences(one, other)
+    return tuple(pair for pair in pairs if pair.path not in _OF_THE_MACHINE)
 
 
 def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[PlannedRun, ...]:
@@ -138,9 +114,16 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[
 
     for cell in cells:
         visit(cell)
-    new = _new_runs(tuple(missing), config, held, _taken_names(root))
+    populations = new_populations(tuple(missing), config, held, _taken_names(root))
+    new = [_planned(population) for population in populations]
     there = sorted(used.values(), key=lambda run: run.state != "cut")
     return _in_order([*there, *new])
+
+
+def _planned(new: Population) -> PlannedRun:
+    return PlannedRun(
+        new.name, tuple(cell.name for cell in new.cells), new.spec, new.spec.method.needs
+    )
 
 
 def _in_order(runs: list[PlannedRun]) -> tuple[PlannedRun, ...]:
@@ -200,7 +183,7 @@ def _inspect(folder: Path) -> PlannedRun:
         if checkpoints.latest() is None:
             # Copied without checkpoints: what is evaluated to the end is done, for tables.
             done = evaluations >= schedule.evaluations
-            needs = () if done else (*spec.sources, *spec.reward_sources)
+            needs = () if done else spec.method.needs
             return PlannedRun(
                 folder.name, cells, spec, needs, "done" if done else "cut", float(done)
             )
@@ -223,170 +206,9 @@ def _evaluations(folder: Path) -> int:
 def _check_settings(folder: Path, run: PlannedRun, config: Config) -> None:
     if run.spec is None:
         return
-    different = [
-        text
-        for text in configs.differences(run.spec.config, config)
-        if not text.startswith(_OF_THE_MACHINE)
-    ]
-    if different:
+    if different := _of_results(run.spec.config, config):
+        told = "; ".join(map(str, different))
         raise ValueError(
-            f"{folder} was made with other settings (there / here: {'; '.join(different)}): "
+            f"{folder} was made with other settings (there / here: {told}): "
             "name another folder with --results, or move that one away"
         )
-
-
-# What is missing.
-
-
-def _new_runs(
-    missing: tuple[Cell, ...], config: Config, held: dict[str, tuple[str, int]], taken: set[str]
-) -> list[PlannedRun]:
-    """Runs of the missing cells, each after those it needs.
-
-    Args:
-      missing: the cells, those that are needed before those that need them.
-      config: the preset's settings.
-      held: where other cells are; those of the new runs are added.
-      taken: names that are not free.
-    """
-    groups: dict[tuple, list[Cell]] = {}
-    for cell in missing:
-        groups.setdefault(_group(cell), []).append(cell)
-    ordered: dict[tuple, None] = {}
-
-    def visit(key: tuple) -> None:
-        for cell in groups[key]:
-            for needed in cell.needs:
-                if _group(needed) in groups and _group(needed) not in ordered:
-                    visit(_group(needed))
-        ordered.setdefault(key)
-
-    for key in groups:
-        visit(key)
-    runs = []
-    for key in ordered:
-        for cells, spec in _populations(groups[key], config, held):
-            name = _free_name(_run_name(cells), taken)
-            taken.add(name)
-            held.update({cell.name: (name, member) for member, cell in enumerate(cells)})
-            needs = (*spec.sources, *spec.reward_sources)
-            runs.append(PlannedRun(name, tuple(cell.name for cell in cells), spec, needs))
-    return runs
-
-
-def _group(cell: Cell) -> tuple:
-    """What cells of one population share. Nothing transfers from cells of a shared one."""
-    if len(cell.tasks) > 1 or cell.method == "uae":
-        return ("alone", cell)
-    if cell.method == "meta":
-        return ("meta", cell.backend, cell.tasks, cell.source)
-    return ("targets", cell.backend, cell.tasks)
-
-
-def _run_name(cells: tuple[Cell, ...]) -> str:
-    first = cells[0]
-    words = [first.backend, "+".join(first.tasks)]
-    if first.method == "scratch":
-        words += ["baseline"] if len(first.tasks) == 1 else [f"seed-{first.seed}"]
-    else:
-        words += [first.method] + ([f"seed-{first.seed}"] if first.method == "uae" else [])
-    return "-".join(words)
-
-
-def _free_name(name: str, taken: set[str]) -> str:
-    number, free = 2, name
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
-
-
-def _populations(
-    cells: list[Cell], config: Config, held: dict[str, tuple[str, int]]
-) -> list[tuple[tuple[Cell, ...], RunSpec]]:
-    """The cells of one group as populations: their cells in the order of the spec's members."""
-    first = cells[0]
-    tasks = tuple(task_name(first.backend, title) for title in first.tasks)
-    config = config_of(first, config)
-    if first.method == "uae":
-        name, member = held[first.source.name]
-        return [
-            (tuple(cells), RunSpec(tasks, (first.seed,), config, (name,), member, method="uae"))
-        ]
-    if first.method == "meta":
-        return [
-            _meta_population(chosen, tasks, config, held)
-            for chosen in _products(cells, _seed, lambda cell: len(cell.reward_sources))
-        ]
-    scratch = [cell for cell in cells if cell.method == "scratch"]
-    targets = [cell for cell in cells if cell.method == "fractional"]
-    # Sources of one population share the place of the agent in theirs.
-    by_place: dict[int, list[Cell]] = {}
-    for cell in targets:
-        by_place.setdefault(held[cell.source.name][1], []).append(cell)
-    found = []
-    for place, some in by_place.items():
-        for chosen in _products(some, _seed, lambda cell: cell.omega, lambda cell: cell.source):
-            sources = dict.fromkeys(cell.source for cell in chosen)
-            spec = RunSpec(
-                tasks,
-                tuple(dict.fromkeys(cell.seed for cell in chosen)),
-                config,
-                tuple(held[source.name][0] for source in sources),
-                place,
-                tuple(dict.fromkeys(cell.omega for cell in chosen)),
-            )
-            if scratch and {cell.seed for cell in scratch} == set(spec.seeds):
-                by_seed = {cell.seed: cell for cell in scratch}
-                chosen += tuple(by_seed[seed] for seed in spec.seeds)
-                spec, scratch = dataclasses.replace(spec, baseline=True), []
-            found.append((chosen, spec))
-    if scratch:
-        seeds = tuple(cell.seed for cell in scratch)
-        found.append((tuple(scratch), RunSpec(tasks, seeds, config)))
-    return found
-
-
-def _meta_population(
-    cells: tuple[Cell, ...],
-    tasks: tuple[str, ...],
-    config: Config,
-    held: dict[str, tuple[str, int]],
-) -> tuple[tuple[Cell, ...], RunSpec]:
-    """Targets with meta-models of several numbers of stored models, the first of one list."""
-    name, member = held[cells[0].source.name]
-    stored = max((cell.reward_sources for cell in cells), key=len)
-    spec = RunSpec(
-        tasks,
-        tuple(dict.fromkeys(cell.seed for cell in cells)),
-        config,
-        (name,),
-        member,
-        method="meta",
-        reward_sources=tuple(held[cell.name][0] for cell in stored),
-        reward_counts=tuple(dict.fromkeys(len(cell.reward_sources) for cell in cells)),
-    )
-    return cells, spec
-
-
-def _seed(cell: Cell) -> int:
-    return cell.seed
-
-
-def _products(cells: Iterable[Cell], *axes: Callable[[Cell], Any]) -> list[tuple[Cell, ...]]:
-    """Splits cells into products of their values along axes, the first axis innermost."""
-    products = [[cell] for cell in cells]
-    for axis in axes:
-        others = [other for other in axes if other is not axis]
-        merged: dict[tuple, list[Cell]] = {}
-        for product in products:
-            values = tuple(frozenset(map(other, product)) for other in others)
-            merged.setdefault(values, []).extend(product)
-        products = list(merged.values())
-    for product in products:
-        values = [list(dict.fromkeys(map(axis, product))) for axis in axes]
-        product.sort(
-            key=lambda cell, values=values: [
-                known.index(axis(cell)) for axis, known in zip(axes, values, strict=True)
-            ][::-1]
-        )
-    return [tuple(product) for product in products]

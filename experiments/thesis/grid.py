@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from experiments import methods
+
 TASKS = ("HalfCheetah", "Hopper", "Walker2D", "InvertedPendulum", "InvertedDoublePendulum", "Ant")
 """Titles of the six tasks, in the order of the thesis's tables."""
 
@@ -45,8 +47,7 @@ class Cell:
     Attributes:
       backend: the simulator.
       tasks: titles of the tasks it is trained on, in the order of `TASKS`.
-      method: "scratch", "fractional" (section 3.2), "uae" (on the universal autoencoder, 3.3.1) or
-        "meta" (a reward meta-model on it, 3.3.2).
+      method: the name of one of `experiments.methods`.
       seed: of the agent and of its simulators.
       source: the agent whose parameters are transferred.
       omega: the fraction of equation 19.
@@ -55,7 +56,7 @@ class Cell:
 
     backend: Backend
     tasks: tuple[str, ...]
-    method: Literal["scratch", "fractional", "uae", "meta"]
+    method: str
     seed: int
     source: "Cell | None" = None
     omega: float | None = None
@@ -65,10 +66,7 @@ class Cell:
     def name(self) -> str:
         """A name that no other cell has."""
         words = [self.backend, "+".join(self.tasks), self.method]
-        if self.method == "fractional":
-            words += ["from", "+".join(self.source.tasks), f"omega={self.omega:g}"]
-        elif self.method == "meta":
-            words += ["from", "+".join(source.tasks[0] for source in self.reward_sources)]
+        words += methods.named(self.method).cell_words(self)
         if self.source is not None:
             words.append(f"source-seed={self.source.seed}")
         return " ".join([*words, f"seed={self.seed}"])

@@ -21,8 +21,8 @@ from experiments.runs import classify
 from experiments.runs.agents import load_source
 from experiments.runs.folder import folders, latents_folder
 from experiments.runs.latents import Latents, gather
-from experiments.thesis.graph import task_name
 from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, Table, multitask
+from experiments.thesis.populations import task_name
 
 SAMPLES = 100
 """Of each task to fit on, and as many to test (section 4.3.2)."""
