@@ -8,6 +8,7 @@ missing.
 Axis letters: E evaluations.
 """
 
+import dataclasses
 import math
 import warnings
 from collections import Counter
@@ -134,20 +135,14 @@ def _outcome(spec: RunSpec, rows: Iterable[Mapping[str, Any]]) -> Outcome:
 
 def read_runs(root: str | Path) -> dict[Path, Run]:
     """The runs of cells under a root by their folders; what cannot be read is warned of."""
-    found = {}
-    for folder in run_folders(root):
-        try:
-            found[folder] = read_run(folder)
-        except (ValueError, KeyError, TypeError) as error:
-            warnings.warn(
-                f"{folder} cannot be read ({error}): its cells count as missing", stacklevel=2
-            )
-    return found
+    return _read(run_folders(root))
 
 
 def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome]:
     """The outcome of each cell, those that have not begun included."""
-    runs, places, outcomes = read_runs(root), folders(root), {}
+    cells, places = tuple(cells), folders(root)
+    runs = _read({places[cell.name][0]: None for cell in cells if cell.name in places})
+    outcomes = {}
     for cell in cells:
         folder, member = places.get(cell.name, (None, 0))
         run = runs.get(folder)
@@ -156,10 +151,20 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
             continue
         one = run.outcomes[member]
         by_title = {envs.spec(task).title: returns for task, returns in one.returns.items()}
-        outcomes[cell] = Outcome(
-            one.env_steps, by_title, one.planned, one.total_env_steps, one.failed_at
-        )
+        outcomes[cell] = dataclasses.replace(one, returns=by_title)
     return outcomes
+
+
+def _read(chosen: Iterable[Path]) -> dict[Path, Run]:
+    found = {}
+    for folder in chosen:
+        try:
+            found[folder] = read_run(folder)
+        except (ValueError, KeyError, TypeError) as error:
+            warnings.warn(
+                f"{folder} cannot be read ({error}): its cells count as missing", stacklevel=3
+            )
+    return found
 
 
 def curves(outcomes: Sequence[Outcome], task: str) -> tuple[np.ndarray, np.ndarray]:
