@@ -115,7 +115,7 @@ def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(demo, root,
     assert written == [grid.DEMO, figure]
     assert metrics(root) == before
     outcomes = read_outcomes(root, [*shown(grid.DEMO, (0, 1)), *shown(figure, (0, 1))])
-    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}
 
 
 def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, tmp_path):
@@ -136,7 +136,7 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, 
     assert thesis._make([META], sweep) == 0
     assert len(targets.cells) == 2
     outcomes = read_outcomes(root, shown(META, (0, 1)))
-    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}
     assert {row["label"] for row in read_metrics(root / targets.name)} == {"sources=2"}
 
 
