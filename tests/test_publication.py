@@ -521,14 +521,6 @@ def test_tables_of_both_simulators_stand_beside_one_another(root, drawn):
         assert f"{simulator}, seeds 0, 1" in (root / folder / "index.html").read_text("utf-8")
 
 
-def test_the_demo_is_a_table_too(tmp_path):
-    root = tmp_path / "debug"
-    write_folder(root, "all", [*targets(grid.DEMO.omegas), *baselines()], rising)
-    text = publication.write_table(grid.DEMO, root, SEEDS, tmp_path / "out")
-    assert text.startswith("Demo: InvertedPendulum, overall return")
-    assert "120 ± 12 | 856 ± 121" in text
-
-
 def test_settings_that_are_not_the_presets_are_named(tmp_path):
     root = tmp_path / "cpu"
 

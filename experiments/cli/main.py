@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import tyro
 
-from experiments.cli import runs, sharing, thesis
+from experiments.cli import demo, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 from experiments.cli.options import Base, read_base
 
@@ -52,7 +52,7 @@ COMMANDS = {
     "table": _plain(thesis.Tables, thesis.tables, thesis.table_defaults),
     "figure": _plain(thesis.Figures, thesis.figures, thesis.figure_defaults),
     "plan": _plain(thesis.Plan, thesis.plan, thesis.plan_defaults),
-    "demo": _plain(thesis.Demo, thesis.demo),
+    "demo": _plain(demo.Demo, demo.demo),
 }
 """All commands by name."""
 

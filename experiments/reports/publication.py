@@ -148,7 +148,7 @@ def _common_notes(table: Table, size: str | None) -> list[str]:
 def returns_sheet(
     table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int], size: str | None
 ) -> Sheet:
-    """Tables 1 to 12, 16 and 17, and the demo's."""
+    """Tables 1 to 12, 16 and 17."""
     entries = comparison.compare(table, outcomes, seeds)
     columns = tuple(f"{count} Tasks" for count in table.counts)
     if table.kind == "ftl":
