@@ -112,7 +112,8 @@ class LearningConfig:
     adam_epsilon: float = setting(1e-7, 0, 1, above=True)
     """Adam's epsilon."""
     frozen: tuple[str, ...] = ()
-    """Components, or parts of them, that take no update (such as encoder, or dynamics/gru)."""
+    """What takes no update: components, parts of them, or single leaves, by their paths (such as
+    encoder, dynamics/gru, or dynamics/prior/out/kernel)."""
 
     def __post_init__(self):
         unknown = {name for name in self.frozen if name.partition("/")[0] not in COMPONENTS}

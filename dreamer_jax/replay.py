@@ -36,18 +36,18 @@ from dreamer_jax.integrity import (
     write_sealed_json,
 )
 from dreamer_jax.prefetch import Prefetcher
+from dreamer_jax.records import Records
 from dreamer_jax.sampling import sample_indices
 from dreamer_jax.schema import check_shape
 from dreamer_jax.stream_checksums import StreamChecksums
 
-Batch = dict[str, np.ndarray]
 _HEADER = "replay.json"
 _DELETED = "deleted.json"
 _FORMAT = 1
 
 
 def record_dtype(image_size: int, action_size: int) -> np.dtype:
-    """The layout of one record on disk: packed, little-endian."""
+    """The layout of one record on disk: packed, little-endian, in the order of `Records`."""
     return np.dtype(
         [
             ("image", "u1", (image_size, image_size, 3)),
@@ -192,28 +192,27 @@ class Replay:
                 raise explained(error, f"could not write {path}", path) from error
             self._deleted = deleted
 
-    def append(self, records: Mapping[str, np.ndarray]) -> None:
+    def append(self, records: Records) -> None:
         """Add a phase to every stream.
 
         Either all streams grow by T records or, if this raises, none does.
 
         Args:
-            records: image uint8 [P, K, T, size, size, 3], action float32 [P, K, T, A],
-                reward float32 [P, K, T], first bool [P, K, T], terminal bool [P, K, T].
+            records: leaves [P, K, T, ...].
 
         Raises:
-            ValueError: a name, shape or dtype is not as above.
+            ValueError: a shape or dtype is not that of the layout.
             OSError: the disk is full or not writable; names the file and the free space.
         """
         records = self._checked(records)
-        steps = records["reward"].shape[2]
+        steps = records.reward.shape[2]
         path = self.directory
         try:
             for stream in self._streams():
                 path = self.path(*stream)
                 rows = np.empty(steps, self.dtype)
                 for name in self.dtype.names:
-                    rows[name] = records[name][stream]
+                    rows[name] = getattr(records, name)[stream]
                 with open(path, "r+b") as file:
                     file.seek(int(self._lengths[stream]) * self.dtype.itemsize)
                     _write(file, rows)
@@ -235,18 +234,15 @@ class Replay:
             raise
         self._lengths += steps
 
-    def _checked(self, records: Mapping[str, np.ndarray]) -> Batch:
-        names = self.dtype.names
-        if set(records) != set(names):
-            raise ValueError(f"records have the keys {sorted(records)}, expected {sorted(names)}")
-        arrays = {name: np.asarray(records[name]) for name in names}
-        steps = arrays["reward"].shape[2] if arrays["reward"].ndim == 3 else "T"
-        for name, array in arrays.items():
+    def _checked(self, records: Records) -> Records:
+        arrays = records.map(np.asarray)
+        steps = arrays.reward.shape[2] if arrays.reward.ndim == 3 else "T"
+        for name, array in arrays._asdict().items():
             field = self.dtype[name]
             expected = (self.members, self.tasks, steps, *field.shape)
             if array.shape != expected or array.dtype != field.base:
                 raise ValueError(
-                    f"records[{name!r}] is {array.dtype} {list(array.shape)}, expected "
+                    f"the records' {name} is {array.dtype} {list(array.shape)}, expected "
                     f"{field.base} {list(expected)} (members, tasks, steps, ...)"
                 )
         return arrays
@@ -387,8 +383,8 @@ class Replay:
                 )
                 return
 
-    def read(self, member: int, task: int, start: int, stop: int) -> Batch:
-        """A copy of the records [start, stop) of one stream, by name.
+    def read(self, member: int, task: int, start: int, stop: int) -> Records:
+        """A copy of the records [start, stop) of one stream, leaves [stop - start, ...].
 
         Raises:
             ValueError: the range is not within the committed records that are not deleted.
@@ -399,13 +395,13 @@ class Replay:
                 f"records [{start}, {stop}) of {self.path(member, task)} were asked for, "
                 f"it holds [{oldest}, {held})"
             )
-        batch = self._empty((stop - start,))
+        records = self._empty((stop - start,))
         if stop > start:
             self._checksums[member, task].check_records(start, stop)
             stream = self._map(member, task)
-            for name in batch:
-                batch[name][:] = stream[name][start:stop]
-        return batch
+            for name, values in records._asdict().items():
+                values[:] = stream[name][start:stop]
+        return records
 
     def sample(
         self,
@@ -415,7 +411,7 @@ class Replay:
         length: int,
         members: Sequence[int] | None = None,
         lengths: np.ndarray | None = None,
-    ) -> Batch:
+    ) -> Records:
         """A batch of sequences for every member.
 
         A member's rows depend only on its own seed, the update and the lengths of its own streams
@@ -431,9 +427,8 @@ class Replay:
                 ones, which are the default).
 
         Returns:
-            image uint8 [P, B, L, size, size, 3], action float32 [P, B, L, A], reward float32,
-            first bool and terminal bool [P, B, L]. The arrays are new and never written again:
-            on the CPU, JAX may use their memory without a copy.
+            Leaves [P, B, L, ...]. The arrays are new and never written again: on the CPU, JAX
+            may use their memory without a copy.
 
         Raises:
             ValueError: no stream of a member holds L records, or arguments do not fit together.
@@ -447,6 +442,7 @@ class Replay:
                 f"lengths {lengths.tolist()} are not at most the committed {self._lengths.tolist()}"
             )
         result = self._empty((len(members), batch, length))
+        fields = result._asdict()
         for position, (member, seed) in enumerate(zip(members, seeds, strict=True)):
             try:
                 tasks, starts = sample_indices(
@@ -465,29 +461,27 @@ class Replay:
                 for row in np.flatnonzero(tasks == task):
                     self._checksums[member, task].check_records(starts[row], starts[row] + length)
                     sequence = stream[starts[row] : starts[row] + length]
-                    for name, values in result.items():
+                    for name, values in fields.items():
                         values[position, row] = sequence[name]
         return result
 
     def batches(
         self, seeds: Sequence[int], updates: Iterable[int], batch: int, length: int, depth: int = 2
-    ) -> Prefetcher[Batch]:
+    ) -> Prefetcher[Records]:
         """The batches of `updates` in turn, prepared in the background (see `Prefetcher`).
 
         All are drawn from the records committed now, even if more are appended meanwhile.
         """
         lengths = self.lengths
 
-        def prepare(update: int) -> Batch:
+        def prepare(update: int) -> Records:
             return self.sample(seeds, update, batch, length, lengths=lengths)
 
         return Prefetcher(prepare, updates, depth)
 
-    def _empty(self, shape: tuple[int, ...]) -> Batch:
-        return {
-            name: np.empty(shape + self.dtype[name].shape, self.dtype[name].base)
-            for name in self.dtype.names
-        }
+    def _empty(self, shape: tuple[int, ...]) -> Records:
+        layouts = (self.dtype[name] for name in Records._fields)
+        return Records(*(np.empty(shape + layout.shape, layout.base) for layout in layouts))
 
     def _map(self, member: int, task: int) -> np.ndarray:
         """A stream as a read-only array of records, mapped from its file for one reading.

@@ -20,13 +20,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, AgentState, Batch, Mode
+from dreamer_jax.agent import Agent, Mode
 from dreamer_jax.diagnosis import diagnose, warnings
+from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Progress
 from dreamer_jax.record_checks import check_records
-from dreamer_jax.rollout import Records, collect, episodes
+from dreamer_jax.records import Records
+from dreamer_jax.rollout import collect, episodes
 from dreamer_jax.run_folder import RunFolder
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.video import tile, write_video
@@ -291,10 +293,10 @@ class Run:
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
         rounds = self.counters.rounds
         records = self._phase(mode, rounds)
-        self.replay.append(records._asdict())
+        self.replay.append(records)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            found = episodes(Records(*(x[member, task] for x in records)))
+            found = episodes(records.at(member, task))
             scores.append(np.mean([episode.score for episode in found]))
             row = {
                 "kind": "collect",
@@ -329,7 +331,7 @@ class Run:
                     self.agent,
                     self.state,
                     self.sums,
-                    Batch(**batch),
+                    batch,
                     mapping=schedule.mapping,
                     chunk=schedule.mapping_chunk,
                 )
@@ -396,7 +398,7 @@ class Run:
         diagnosis = jax.device_get(found)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            episode = episodes(Records(*(x[member, task] for x in records)))[0]
+            episode = episodes(records.at(member, task))[0]
             scores.append(episode.score)
             row = {
                 "kind": "evaluation",

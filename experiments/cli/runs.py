@@ -1,4 +1,4 @@
-"""Commands on one run: train, evaluate, classify, report. Their options, and what they do.
+"""Commands on one run: train, evaluate, classify. Their options, and what they do.
 
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
@@ -19,7 +19,7 @@ from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.ranges import setting
 from experiments import methods
-from experiments.cli.exits import FAILURE, STOPPED, UsageError, usage_errors
+from experiments.cli.exits import FAILURE, STOPPED, usage_errors
 from experiments.cli.options import (
     DEFAULT_PRESET,
     Base,
@@ -31,7 +31,6 @@ from experiments.cli.options import (
     method_summary,
     sequence,
 )
-from experiments.thesis.grid import SEEDS, Backend
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,8 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
@@ -175,28 +176,12 @@ class Classify:
     or each image as if it were the first of an episode."""
     seed: int = setting(0, 0, 2**31 - 1)
     """Of episodes, actions and samples."""
+    accept_failed: bool = False
+    """Take agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """Print the table of a results folder and draw its learning curves.
-
-    Of several folders: of all of them beside each other. Of a folder of all results of a preset
-    (results/cpu): write all tables, figures and the page.
-    """
-
-    directories: tyro.conf.Positional[tuple[Path, ...]]
-    """The results folder, or several."""
-    out: Path = Path("comparison.png")
-    """Of several folders: the picture to draw; an .svg is written beside it."""
-    seeds: tuple[int, ...] = setting(SEEDS, 0, 2**31 - 1)
-    """Of all results: the seeds that tables and figures show."""
-    backend: Backend = "bullet"
-    """Of all results: the simulators."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +194,7 @@ class Verify:
 
 def train(command: Train) -> int:
     """Trains a population."""
+    from experiments.cli.reports import Report, report
     from experiments.runs.spec import RunSpec
     from experiments.runs.trust import check_trust, is_of_another
 
@@ -226,14 +212,17 @@ def train(command: Train) -> int:
         check_trust([*method.sources, *method.stored], run.trust)
         if is_of_another(run.out):
             check_trust([run.out], run.trust)
+    from dreamer_jax.host_memory import keep_freed_memory
     from experiments.runs.run import carry_out, make_run
 
+    keep_freed_memory()
     with usage_errors():
         begun = make_run(
             spec,
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.workers,
+            accept_failed=run.accept_failed,
             timeout=run.simulator_timeout,
             from_checkpoint=run.from_checkpoint,
         )
@@ -243,32 +232,6 @@ def train(command: Train) -> int:
         print(f"stopped and saved in {run.out}: the same command with --resume continues")
         return STOPPED
     return report(Report((run.out,)))
-
-
-def report(command: Report) -> int:
-    """Shows a run, several beside each other, or all results under a folder."""
-    from experiments.cli.thesis import report_all
-    from experiments.reports import summary
-    from experiments.runs.folder import run_folders
-
-    if not command.directories:
-        raise UsageError("nothing to report: name a results folder, or several")
-    if len(command.directories) > 1:
-        with usage_errors():
-            print(summary.table(summary.compare(command.directories)))
-            picture, _ = summary.plot_comparison(command.directories, command.out)
-        print(f"learning curves: {picture}")
-        return 0
-    (directory,) = command.directories
-    if not (directory / "run.json").exists() and run_folders(directory):
-        return report_all(directory, command.seeds, command.backend)
-    with usage_errors():
-        summaries = summary.summarise(directory)
-    print(summary.table(summaries))
-    if summary.evaluations(directory):
-        picture, _ = summary.plot_curves(directory)
-        print(f"learning curves: {picture}")
-    return 0
 
 
 def verify(command: Verify) -> int:
@@ -357,8 +320,9 @@ def classify(command: Classify) -> int:
     with usage_errors():
         classify.check_request(command.task, command.known, actors=command.actors, **request)
         check_trust([command.source, *command.actors], command.trust)
-        source = load_source(command.source, command.source_member)
-        actors = [load_source(directory) for directory in command.actors]
+        load = functools.partial(load_source, accept_failed=command.accept_failed)
+        source = load(command.source, command.source_member)
+        actors = [load(directory) for directory in command.actors]
         with Progress() as bar:
             total = classify.rounds(source, command.samples) * max(1, len(actors))
             job = bar.add_task("gathering samples", total=total)

@@ -6,16 +6,15 @@ and read there. A folder that cannot be read is warned of, and its cells count a
 """
 
 import contextlib
+import math
 import re
 import warnings
 from pathlib import Path
-from typing import Any
 
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
 from dreamer_jax.integrity import DamagedError, read_sealed_json
 from dreamer_jax.logs import read_metrics
-from dreamer_jax.schema import EVALUATION_ROW, check_shape
 
 CELLS = "cells.json"
 
@@ -64,22 +63,6 @@ def read_cells(folder: Path) -> tuple[str, ...]:
     return tuple(names)
 
 
-def read_evaluations(directory: str | Path, **also: Any) -> list[dict[str, Any]]:
-    """The rows of a results folder's evaluations.
-
-    Args:
-      directory: the folder.
-      also: names that rows must have besides those that all have, and their kinds.
-
-    Raises:
-      DamagedError: one lacks what the rows of evaluations have; names the file.
-    """
-    rows = [row for row in read_metrics(directory) if row["kind"] == "evaluation"]
-    for row in rows:
-        check_shape(row, EVALUATION_ROW | also, Path(directory) / "metrics.jsonl")
-    return rows
-
-
 def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
     """Where each cell is: its name -> (results folder, member)."""
     found = {}
@@ -92,6 +75,20 @@ def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
         for member, name in enumerate(names):
             found.setdefault(name, (folder, member))
     return found
+
+
+def failed_members(folder: str | Path) -> frozenset[int]:
+    """The members of a run that met losses, gradients or returns that are not finite, by place.
+
+    Such a member was frozen as it was before; its rows say so from then on.
+    """
+    folder = Path(folder)
+    rows = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
+    return frozenset(
+        row["member"]
+        for row in rows
+        if not (row.get("healthy", True) and math.isfinite(row.get("return", 0.0)))
+    )
 
 
 def latents_folder(root: str | Path, backend: str, seed: int) -> Path:

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
@@ -73,11 +74,11 @@ class Estimate:
     disk: int
 
 
-def _shapes(agent: Agent, members: int) -> Batch:
+def _shapes(agent: Agent, members: int) -> Records:
     """A batch's shapes and dtypes, leaves [P, B, L, ...]."""
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (members, learning.batch_size, learning.sequence_length)
-    return Batch(
+    return Records(
         image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
         action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
         reward=jax.ShapeDtypeStruct(shape, jnp.float32),
@@ -86,10 +87,10 @@ def _shapes(agent: Agent, members: int) -> Batch:
     )
 
 
-def _batch(agent: Agent, members: int) -> Batch:
+def _batch(agent: Agent, members: int) -> Records:
     """Records of the sizes of a batch, leaves [P, B, L, ...]."""
     random, shapes = np.random.default_rng(0), _shapes(agent, members)
-    batch = Batch(*(np.zeros(x.shape, x.dtype) for x in shapes))
+    batch = Records(*(np.zeros(x.shape, x.dtype) for x in shapes))
     return batch._replace(image=random.integers(0, 256, batch.image.shape, dtype=np.uint8))
 
 
@@ -351,6 +352,7 @@ def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
+        state += f", {len(run.failed)} failed" if run.failed else ""
         tasks = "-" if run.spec is None else " + ".join(run.spec.tasks)
         needs = ", ".join(numbers.get(name, name) for name in run.needs) or "-"
         row = [f"{numbers[run.name]:>2}  {run.name}", str(len(run.cells)), tasks, needs, state]

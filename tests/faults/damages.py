@@ -19,7 +19,8 @@ from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.config import preset
 from dreamer_jax.integrity import DamagedError, write_sealed_json
 from dreamer_jax.run_folder import RunFolder
-from experiments.runs.folder import read_cells, read_evaluations
+from experiments.reports.outcomes import read_run
+from experiments.runs.folder import read_cells
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.runs.verify import findings_of
 
@@ -76,8 +77,8 @@ def make_folder(directory: Path, phases: int = 4) -> Path:
 
 def read_all(directory: Path) -> tuple:
     """All that a resumed run and a report read, as values that can be compared."""
-    spec, cells = read_spec(directory), read_cells(directory)
-    rows = repr(read_evaluations(directory, label=str))
+    spec, cells, rows = read_spec(directory), read_cells(directory), repr(read_run(directory))
+    rows = rows.replace(str(directory), "")
     folder = RunFolder(directory, lock=None, resume=True, layout=LAYOUT)
     try:
         tree, counters = folder.restore(state(0))
