@@ -15,6 +15,7 @@ from dreamer_jax.integrity import (
     write_sealed_json,
 )
 from dreamer_jax.logs import MetricsWriter
+from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 from dreamer_jax.run_folder import RunFolder
 
@@ -28,13 +29,13 @@ def counters(rounds):
 def phase(steps, seed):
     random = np.random.default_rng(seed)
     shape = (2, 1, steps)
-    return {
-        "image": random.integers(0, 256, (*shape, 4, 4, 3), dtype=np.uint8),
-        "action": random.normal(size=(*shape, 2)).astype(np.float32),
-        "reward": random.normal(size=shape).astype(np.float32),
-        "first": np.zeros(shape, bool),
-        "terminal": np.zeros(shape, bool),
-    }
+    return Records(
+        image=random.integers(0, 256, (*shape, 4, 4, 3), dtype=np.uint8),
+        action=random.normal(size=(*shape, 2)).astype(np.float32),
+        reward=random.normal(size=shape).astype(np.float32),
+        first=np.zeros(shape, bool),
+        terminal=np.zeros(shape, bool),
+    )
 
 
 def flip(path, place, bit=0):

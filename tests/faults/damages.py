@@ -18,6 +18,7 @@ import numpy as np
 from dreamer_jax.checkpoint import CorruptCheckpointError
 from dreamer_jax.config import preset
 from dreamer_jax.integrity import DamagedError, write_sealed_json
+from dreamer_jax.records import Records
 from dreamer_jax.run_folder import RunFolder
 from experiments.reports.outcomes import read_run
 from experiments.runs.folder import read_cells
@@ -57,13 +58,13 @@ def make_folder(directory: Path, phases: int = 4) -> Path:
     for number in range(phases):
         chance, shape = np.random.default_rng(number), (2, 1, 21)
         folder.replay.append(
-            {
-                "image": chance.integers(0, 256, (*shape, 8, 8, 3), dtype=np.uint8),
-                "action": chance.normal(size=(*shape, 2)).astype(np.float32),
-                "reward": chance.normal(size=shape).astype(np.float32),
-                "first": np.arange(21) % 7 == np.zeros(shape, int),
-                "terminal": np.zeros(shape, bool),
-            }
+            Records(
+                image=chance.integers(0, 256, (*shape, 8, 8, 3), dtype=np.uint8),
+                action=chance.normal(size=(*shape, 2)).astype(np.float32),
+                reward=chance.normal(size=shape).astype(np.float32),
+                first=np.arange(21) % 7 == np.zeros(shape, int),
+                terminal=np.zeros(shape, bool),
+            )
         )
         for member in range(2):
             row = {"kind": "evaluation", "member": member, "seed": member, "label": "baseline"}
@@ -86,7 +87,7 @@ def read_all(directory: Path) -> tuple:
         records = [
             value.tobytes()
             for stream in np.ndindex(*lengths.shape)
-            for value in replay.read(*stream, 0, int(lengths[stream])).values()
+            for value in replay.read(*stream, 0, int(lengths[stream]))
         ]
         metrics = (directory / "metrics.jsonl").read_bytes()
     finally:
