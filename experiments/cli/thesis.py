@@ -239,6 +239,11 @@ def plan(command: Plan) -> int:
             f"{1000 * max(speed.tick_seconds.values()):.1f} ms for a tick of\nthe slowest "
             "simulator here and now. Runs come one after another; each is compiled first."
         )
+        if speed.scaled > 1:
+            print(
+                f"The update was measured on smaller batches, and multiplied by {speed.scaled:.3g}: "
+                f"expect its time and memory to be off by up to {estimate.SCALING_ERROR:.0%}."
+            )
     return 0
 
 

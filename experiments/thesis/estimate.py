@@ -32,6 +32,10 @@ from experiments.thesis.graph import PlannedRun
 SAMPLE_OPERATIONS = 1e11
 """An update that does no more than this is measured as it is."""
 
+SCALING_ERROR = 0.5
+"""By how much the time of a large update may differ from that scaled from smaller batches
+(docs/reliability.md has what was measured)."""
+
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
 
 
@@ -48,6 +52,8 @@ class Speed:
       tick_compile_seconds: until a tick of a simulator is, by name of task; physics that is part
         of the program takes long.
       workers: simulator processes that work at once.
+      scaled: by how much the time of an update on smaller batches was multiplied; 1 if the update
+        itself was measured.
     """
 
     update_seconds: float
@@ -57,6 +63,7 @@ class Speed:
     compile_seconds: float
     tick_compile_seconds: Mapping[str, float]
     workers: int
+    scaled: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -208,6 +215,7 @@ def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what:
         compile_seconds=compile_seconds,
         tick_compile_seconds={task: first for task, (_, first) in ticks.items()},
         workers=available_cores(),
+        scaled=times,
     )
 
 
