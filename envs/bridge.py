@@ -102,6 +102,8 @@ class HostEnv:
         workers: number of worker processes, by default min(cores, slots).
     """
 
+    has_host = True
+
     def __init__(
         self,
         tasks: Sequence[TaskSpec],
