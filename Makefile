@@ -20,7 +20,7 @@ RUN    := $(VENV)/bin/python
 STAMP   = $(VENV)/.installed-
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint tables figures plan train sweep evaluate report bench clean
+.PHONY: help setup demo test lint hooks docs tables figures plan train sweep evaluate report bench clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/%/N/; s/:.*## /|/' | \
@@ -65,9 +65,16 @@ $(VENV)/.weights: $(STAMP)bullet+brax+gymnasium+dev
 test: $(STAMP)bullet+brax+gymnasium+dev $(VENV)/.weights  ## Run the test suite (15 minutes)
 	$(RUN) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
 
-lint: $(STAMP)bullet+brax+gymnasium+dev  ## Check the style
+lint: $(STAMP)bullet+brax+gymnasium+dev  ## Check style and types
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
+	$(RUN) -m mypy
+
+hooks: $(STAMP)bullet+brax+gymnasium+dev  ## Let git check style and types before each commit
+	$(RUN) -m pre_commit install
+
+docs: $(STAMP)docs  ## Build the pages and the reference of modules into site/
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
 
 train: $(STAMP)bullet+brax+gymnasium  ## Train on TASK with SEEDS and PRESET into OUT (resumes what is there)
 	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --out $(OUT) --resume $(ARGS)
@@ -87,4 +94,4 @@ bench: $(STAMP)bullet+brax+gymnasium+dev  ## Run the benchmarks and write runs/b
 	$(RUN) -m benchmarks runs/benchmarks $(ARGS)
 
 clean:  ## Remove .venv and caches; runs/ and results/ stay
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .hypothesis *.egg-info site

@@ -23,7 +23,7 @@ import jax
 from benchmarks.update import read_arguments
 from dreamer_jax.config import preset
 from dreamer_jax.host_memory import keep_freed_memory
-from experiments.run import RunSpec, make_run
+from experiments.runs.run import RunSpec, make_run
 
 DEFAULTS = {"task": "bullet/inverted_pendulum", "preset": "cpu", "P": 1}
 

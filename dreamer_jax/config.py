@@ -6,7 +6,7 @@ The defaults are those of the thesis (sections 3.1 and 4.2.2) and of Dreamer ver
 import dataclasses
 import difflib
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 COMPONENTS = ("encoder", "decoder", "dynamics", "reward", "termination", "value", "actor")
 
@@ -331,15 +331,31 @@ def from_dict(values: dict) -> Config:
     return Config(**built)
 
 
-def differences(one: Config, other: Config) -> list[str]:
-    """Settings in which two configurations differ, as "group.name: 1 / 2"."""
+class Difference(NamedTuple):
+    """A setting in which two things differ.
+
+    Attributes:
+      path: its name, such as "learning.batch_size".
+      one, other: its value in the first and in the second; None where one has no such setting.
+    """
+
+    path: str
+    one: Any
+    other: Any
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.one} / {self.other}"
+
+
+def differences(one: Config, other: Config) -> tuple[Difference, ...]:
+    """Settings in which two configurations differ."""
     first, second = to_dict(one), to_dict(other)
-    return [
-        f"{group}.{name}: {first[group][name]} / {second[group][name]}"
+    return tuple(
+        Difference(f"{group}.{name}", first[group][name], second[group][name])
         for group in first
         for name in first[group]
         if first[group][name] != second[group][name]
-    ]
+    )
 
 
 def preset(name: str) -> Config:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,48 @@ def tile(videos: np.ndarray, border: int = 2, colour: int = 255) -> np.ndarray:
     bordered = np.pad(videos, ((0, 0), (0, 0), (0, 0), (0, border), (0, 0)), constant_values=colour)
     row = np.concatenate(list(bordered), axis=2)
     return row[:, :, : row.shape[2] - border]
+
+
+def captioned(videos: np.ndarray, captions: Sequence[str], border: int = 8) -> np.ndarray:
+    """Videos side by side, enlarged, each with its caption above it: black on white.
+
+    Args:
+        videos: uint8 [N, T, height, width, 3].
+        captions: one for each video, in Latin letters; a line break begins a new line.
+        border: white pixels around every video.
+
+    Returns:
+        uint8 [T, taller, wider, 3].
+
+    Raises:
+        ValueError: the videos have another shape, or there are more or fewer captions.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    videos = np.asarray(videos)
+    if videos.ndim != 5 or videos.shape[-1] != 3 or len(videos) != len(captions) or not captions:
+        raise ValueError(
+            f"videos have shape {list(videos.shape)} and there are {len(captions)} captions, "
+            "expected [videos, frames, height, width, 3] and one for each video"
+        )
+    factor = -(-_SMALLEST_SIDE // min(videos.shape[2:4]))
+    height, width = (factor * side for side in videos.shape[2:4])
+    font = ImageFont.load_default(size=16)
+    lines = max(caption.count("\n") + 1 for caption in captions)
+    top = 22 * lines + border
+    strip = Image.new("RGB", (len(captions) * (width + border) + border, top), "white")
+    for i, caption in enumerate(captions):
+        centre = border + i * (width + border) + width / 2
+        ImageDraw.Draw(strip).multiline_text(
+            (centre, border / 2), caption, fill="black", font=font, anchor="ma", align="center"
+        )
+    frames = np.full((videos.shape[1], top + height + border, strip.width, 3), 255, dtype=np.uint8)
+    frames[:, :top] = np.asarray(strip)
+    for i, video in enumerate(videos):
+        left = border + i * (width + border)
+        large = video.repeat(factor, axis=1).repeat(factor, axis=2)
+        frames[:, top : top + height, left : left + width] = large
+    return frames
 
 
 def _enlarged(frame: np.ndarray, even: bool) -> np.ndarray:

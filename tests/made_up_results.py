@@ -6,8 +6,8 @@ import envs
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.schedule import Schedule
-from experiments.graph import task_name
-from experiments.spec import RunSpec
+from experiments.runs.spec import RunSpec
+from experiments.thesis.populations import task_name
 
 VERSIONS = {"python": "3.11.7", "jax": "0.10.2", "backend": "cpu"}
 

@@ -12,18 +12,20 @@ from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.schedule import Counters, Schedule
-from experiments.agents import Source, load_source, make_agent, plan
-from experiments.spec import RunSpec
+from experiments import methods
+from experiments.methods.autoencoder import UniversalAutoencoder
+from experiments.runs.agents import Source, load_source, make_agent
+from experiments.runs.spec import RunSpec
 
 CONFIG = preset("debug")
 
 
-def spec_of(*tasks, seeds=(0,), config=CONFIG, **settings) -> RunSpec:
-    """A spec for tasks named without their backend."""
+def spec_of(*tasks, seeds=(0,), config=CONFIG, method=None, **settings) -> RunSpec:
+    """A spec for tasks named without their backend, with a method and its settings."""
     names = tuple(f"bullet/{task}" for task in tasks)
     for name in {"sources", "reward_sources"} & set(settings):
         settings[name] = tuple(map(str, settings[name]))
-    return RunSpec(names, seeds, config, **settings)
+    return RunSpec(names, seeds, config, methods.make(method, settings))
 
 
 def random_params(agent, seed=0):
@@ -33,19 +35,20 @@ def random_params(agent, seed=0):
     return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
 
 
-def write_run(directory, spec: RunSpec, seed=0, keep=False) -> Source:
+def write_run(directory, spec: RunSpec, seed=0, keep=False, counters=None) -> Source:
     """A results folder of agents with random parameters, after the run's method.
 
     Args:
       keep: leave what the folder holds beside the parameters as it is.
+      counters: how far the run is, for what asks.
 
     Returns:
       Its first agent.
     """
     params = random_params(make_agent(spec), seed)
-    if spec.method == "uae":
-        source = load_source(spec.sources[0])
-        given, claims = transfer.flatten(source.params), transfer.claims(plan(spec), params)
+    if type(spec.method) is UniversalAutoencoder:
+        source = load_source(spec.method.sources[0])
+        given, claims = transfer.flatten(source.params), transfer.claims(spec.method.plan(), params)
         copied = [path for path, rule in claims.items() if rule.operation == "copy"]
         params = transfer.unflatten(params, {path: given[path] for path in copied})
     params = jax.tree.map(lambda x: np.stack([x] * len(spec.members)), params)
@@ -54,7 +57,8 @@ def write_run(directory, spec: RunSpec, seed=0, keep=False) -> Source:
         step = checkpoints.latest()
         checkpoints.save(step, {"agent": {"params": params}}, checkpoints.metadata(step))
         return load_source(directory)
-    checkpoints.save(0, {"agent": {"params": params}}, {})
+    metadata = {} if counters is None else {"counters": counters}
+    checkpoints.save(0, {"agent": {"params": params}}, metadata)
     write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
     return load_source(directory)
 

@@ -1,4 +1,4 @@
-"""Every block of Python in the pages of docs/ runs and prints what the page shows under it."""
+"""The pages of docs/: their Python runs and prints what they show; what they name is there."""
 
 import contextlib
 import io
@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parent.parent / "docs"
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in DOCS.glob("*.md")))
 BLOCK = re.compile(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", re.DOTALL)
 
 
@@ -49,3 +51,28 @@ def test_the_page_shows_three_uses():
     assert all(
         "dreamer_jax" not in code for title in uses for code, _ in sections("transfer.md")[title]
     )
+
+
+def test_the_page_on_environments_makes_one():
+    pytest.importorskip("pybullet")
+    (code,) = BLOCK.findall((DOCS / "environments.md").read_text(encoding="utf-8"))
+    names = {}
+    exec(code[0], names)
+    assert names["image"].shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_files_that_a_page_names_are_there(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text)
+    named = re.findall(
+        r"\b(?:benchmarks|docs|dreamer_jax|envs|experiments|tests|transfer)/[\w/.-]+\.\w+\b", text
+    )
+    local = {(ROOT / page).parent / link for link in links if not link.startswith("https://")}
+    assert [
+        str(path) for path in local | {ROOT / name for name in named} if not path.exists()
+    ] == []
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150

@@ -6,10 +6,11 @@ import shutil
 import pytest
 
 from dreamer_jax.config import preset
-from experiments import grid
-from experiments.graph import plan_runs
-from experiments.grid import FIGURES, TABLES, closure, shown
-from experiments.results import folders, read_cells, read_outcomes
+from experiments.reports.outcomes import read_outcomes
+from experiments.runs.folder import folders, read_cells
+from experiments.thesis import grid
+from experiments.thesis.graph import plan_runs
+from experiments.thesis.grid import FIGURES, TABLES, closure, shown
 from runs import CONFIG, finish
 
 
@@ -47,8 +48,8 @@ def test_targets_with_meta_models_of_two_to_four_sources_are_one_population():
     # An autoencoder, 6 agents on it, and for each target 9 of meta-models and 3 baselines.
     assert sorted(len(run.cells) for run in runs) == sorted([1] + 6 * [1] + 6 * [9] + 6 * [3])
     (run,) = (run for run in runs if run.name == "bullet-Hopper-meta")
-    assert run.spec.reward_counts == (2, 3, 4)
-    assert run.spec.reward_sources == tuple(
+    assert run.spec.method.reward_counts == (2, 3, 4)
+    assert run.spec.method.reward_sources == tuple(
         f"bullet-{task}-uae-seed-0" for task in grid.SOURCES["Hopper"]
     )
 
@@ -65,7 +66,7 @@ def test_each_agent_is_the_member_that_its_cell_says(entries):
             assert member.tags.get("omega") == cell.omega
             if cell.method == "meta":
                 assert member.tags["sources"] == len(cell.reward_sources)
-            if cell.method == "fractional" and len(run.spec.sources) > 1:
+            if cell.method == "fractional" and len(run.spec.method.sources) > 1:
                 assert member.tags["source"] == "bullet-" + "+".join(cell.source.tasks) + "-seed-0"
 
 
@@ -93,7 +94,7 @@ def test_what_is_done_is_not_planned_again(tmp_path):
 def test_agents_that_another_table_made_are_shared(tmp_path):
     finish_all(plan(FIGURES["figure-36"]), tmp_path)
     (targets,) = (run for run in plan(TABLES["table-3"], root=tmp_path) if len(run.cells) > 3)
-    assert len(targets.cells) == 54 and not targets.spec.baseline
+    assert len(targets.cells) == 54 and not targets.spec.method.baseline
 
 
 def test_what_is_missing_of_a_population_is_made_in_another(tmp_path):
@@ -101,7 +102,7 @@ def test_what_is_missing_of_a_population_is_made_in_another(tmp_path):
     runs = plan(SMALL, seeds=(0, 1, 2), root=tmp_path)
     (new,) = (run for run in runs if run.state == "missing")
     assert new.name == "bullet-Hopper-fractional-2"
-    assert new.spec.seeds == (1, 2) and new.spec.baseline
+    assert new.spec.seeds == (1, 2) and new.spec.method.baseline
     finish(new, tmp_path)
     assert {run.state for run in plan(SMALL, root=tmp_path)} == {"done"}
     outcomes = read_outcomes(tmp_path, cells_of(SMALL))
@@ -113,7 +114,7 @@ def test_what_is_missing_and_no_product_is_split_into_products(tmp_path):
     finish_all(plan(dataclasses.replace(whole, omegas=(0.1,)), seeds=(0,)), tmp_path)
     runs = [run for run in plan(more, seeds=(0, 1), root=tmp_path) if run.state == "missing"]
     # Fraction 0.1 lacks seed 1, the others both; the baseline lacks seed 1.
-    assert {(run.spec.omegas, run.spec.seeds, run.spec.baseline) for run in runs} == {
+    assert {(run.spec.method.omegas, run.spec.seeds, run.spec.method.baseline) for run in runs} == {
         ((0.1,), (1,), True),
         ((0.2, 0.3), (0, 1), False),
     }

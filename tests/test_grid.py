@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 
-from experiments import grid
-from experiments.grid import FIGURES, TABLES, closure, on_backend, shown
+from experiments.thesis import grid
+from experiments.thesis.grid import FIGURES, TABLES, closure, on_backend, shown
 
 EVERYTHING = [*TABLES.values(), *FIGURES.values()]
 

@@ -16,11 +16,11 @@ from dreamer_jax import rssm
 from dreamer_jax.agent import Batch
 from dreamer_jax.networks import Head
 from dreamer_jax.rollout import Records
-from experiments import methods
-from experiments.agents import make_agent, plan
-from experiments.latents import infer
-from experiments.meta_modules import recognise
-from experiments.methods import load_sources, stored_models, transferred_members
+from experiments.methods.meta import MetaModel
+from experiments.methods.modules.meta import recognise
+from experiments.runs.agents import make_agent
+from experiments.runs.latents import infer
+from experiments.runs.start import load_sources, transferred_members
 from runs import CONFIG, batch_for, random_params, spec_of, write_run
 from transfer.ltc import NOVEL
 from transfer_trees import bits
@@ -68,12 +68,18 @@ def meta_spec(folder, *tasks, suffix="", **settings):
     )
 
 
+def stored_models(spec, sources, action_size):
+    """What the members' meta-models hold."""
+    counts = [member.tags["sources"] for member in spec.members]
+    return spec.method.stored_models(sources.stored, counts, action_size=action_size)
+
+
 def meta_agent(spec):
     """Agent, sources, and parameters that hold the sources' models, of a run's first member."""
     agent, sources = make_agent(spec), load_sources(spec)
     params = random_params(agent)
-    stored = stored_models(spec, sources.stored, action_size=agent.action_size)
-    for name in spec.meta:
+    stored = stored_models(spec, sources, action_size=agent.action_size)
+    for name in spec.method.meta:
         params[name] |= member(stored[name], 0)
     return agent, sources, params
 
@@ -96,7 +102,7 @@ def usual(agent, name):
 def test_fractions_of_any_components_last_layer_are_a_setting_of_a_run():
     spec = spec_of("hopper", sources=("x",), omegas=(0.2,), fractions=("value", "dynamics"))
     tree = jax.eval_shape(make_agent(spec).init_params, jax.random.key(0))
-    claims = transfer.claims(plan(spec), tree)
+    claims = transfer.claims(spec.method.plan(), tree)
     mixed = {path for path, rule in claims.items() if rule.operation == "fraction"}
     layers = ("dynamics/posterior/out", "dynamics/prior/out", "value/out")
     assert mixed == {f"{layer}/{leaf}" for layer in layers for leaf in ("bias", "kernel")}
@@ -197,7 +203,7 @@ def test_targets_with_two_three_and_four_sources_are_one_population(folder):
     spec = meta_spec(folder, *tasks, reward_counts=(2, 3, 4), seeds=(0, 1))
     assert [m.label for m in spec.members[::2]] == ["sources=2", "sources=3", "sources=4"]
     sources = load_sources(spec)
-    stored = stored_models(spec, sources.stored, action_size=1)["reward"]["stored"]
+    stored = stored_models(spec, sources, action_size=1)["reward"]["stored"]
     assert_array_equal(stored["present"].sum(1), [2, 2, 3, 3, 4, 4])
     for p, tagged in enumerate(spec.members):
         for place, source in enumerate(sources.stored[: tagged.tags["sources"]]):
@@ -209,7 +215,7 @@ def test_exactly_what_is_frozen_does_not_move_by_a_bit_in_a_thousand_updates(fol
         folder, "hopper", "ant", suffix="_frozen", dynamics="frozen", meta=("reward", "value"),
         switching=True,
     )  # fmt: skip
-    monkeypatch.setattr(methods, "known_tasks", lambda *_, **__: classifier_of(0.5))
+    monkeypatch.setattr(MetaModel, "known_tasks", lambda *_: classifier_of(0.5))
     agent, sources = make_agent(spec), load_sources(spec)
     state, report = transferred_members(spec, sources)
     start, batch = member(state, 0), batch_for(agent)
@@ -222,7 +228,7 @@ def test_exactly_what_is_frozen_does_not_move_by_a_bit_in_a_thousand_updates(fol
     assert end.updates == 1000 and end.healthy
     before, after = bits(start.params), bits(end.params)
     still = {path for path in before if after[path] == before[path]}
-    claims = transfer.claims(plan(spec), start.params)
+    claims = transfer.claims(spec.method.plan(), start.params)
     assert still == {path for path, rule in claims.items() if rule.frozen}
     assert {"encoder/conv_0/kernel", "dynamics/gru/kernel", "reward/classifier/latents"} < still
     assert {row.leaf for row in report.rows if row.frozen} == still
@@ -453,8 +459,9 @@ def test_sources_of_other_sizes_are_refused_naming_both(folder):
 
 def test_a_meta_model_is_not_stored_in_another(folder, tmp_path):
     write_run(tmp_path / "meta", meta_spec(folder, "hopper"))
-    spec = meta_spec(folder, "hopper", reward_counts=())
-    spec = dataclasses.replace(spec, reward_sources=(str(tmp_path / "meta"),))
+    spec = meta_spec(folder, "hopper")
+    method = dataclasses.replace(spec.method, reward_sources=(str(tmp_path / "meta"),))
+    spec = dataclasses.replace(spec, method=method)
     with pytest.raises(ValueError, match="the reward of .*meta is a meta-model itself"):
         load_sources(spec)
 
@@ -463,12 +470,12 @@ def test_a_spec_says_all_of_a_method_after_json(folder):
     spec = meta_spec(folder, "hopper", "ant", reward_counts=(1, 2), meta=("reward", "value"))
     assert type(spec).from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
     assert make_agent(spec) == make_agent(dataclasses.replace(spec, seeds=(9,)))
-    assert "meta-model of reward, value, fresh dynamics" in str(plan(spec))
+    assert "meta-model of reward, value, fresh dynamics" in str(spec.method.plan())
 
 
 def test_latent_states_that_are_not_finite_are_novel_and_counted():
-    from experiments.classify import distance_table, judge, to_dict
-    from experiments.latents import Latents
+    from experiments.runs.classify import distance_table, judge, to_dict
+    from experiments.runs.latents import Latents
 
     random = np.random.default_rng(0)
     episodes = np.arange(20) // 4

@@ -11,8 +11,9 @@ from numpy.testing import assert_array_equal
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.logs import read_metrics
 from experiments.__main__ import main
-from experiments.agents import load_source
-from experiments.methods import known_tasks, load_sources
+from experiments.runs.agents import load_source
+from experiments.runs.latents import own_latents
+from experiments.runs.start import load_sources
 from runs import spec_of, write_run
 from transfer_trees import bits
 
@@ -81,7 +82,7 @@ def test_a_meta_run_that_is_resumed_is_the_same_to_the_byte(runs, tmp_path):
     newest = checkpoints.latest()
     shutil.rmtree(checkpoints.path(newest))
     assert checkpoints.latest() < newest
-    spec = json.loads((runs / "target" / "run.json").read_text())["spec"]
+    spec = json.loads((runs / "target" / "run.json").read_text())["spec"]["method"]
     train(
         tmp_path / "target", TASKS[0], "--method", "meta", "--source", *spec["sources"],
         "--reward-sources", *spec["reward_sources"], "--reward-counts", 1, 2, "--resume",
@@ -102,11 +103,12 @@ def test_a_switching_target_knows_the_tasks_of_its_sources(tmp_path):
         write_run(tmp_path / task, spec_of(task, method="uae", **on), seed)
     stored = [tmp_path / task for task in TASKS]
     spec = spec_of(TASKS[0], method="meta", reward_sources=stored, switching=True, **on)
-    classifier = known_tasks(spec, load_sources(spec).stored)
+    classifier = spec.method.known_tasks(load_sources(spec).stored, own_latents)
     assert np.bincount(classifier["labels"]).tolist() == [100, 100]
     assert len(np.unique(classifier["latents"], axis=0)) == 200
     assert 0 < classifier["threshold"] < np.inf
-    given = known_tasks(dataclasses.replace(spec, threshold=7.0), load_sources(spec).stored)
+    given = dataclasses.replace(spec.method, threshold=7.0)
+    given = given.known_tasks(load_sources(spec).stored, own_latents)
     assert given["threshold"] == 7
     assert_array_equal(given["latents"], classifier["latents"])
 

@@ -16,15 +16,18 @@ import pytest
 from dreamer_jax.config import preset
 from dreamer_jax.video import write_video
 from envs import SimulatorError
-from experiments import comparison, figures, grid, grid_commands, page, publication, report, results
-from experiments.contradictions import CONTRADICTIONS
-from experiments.grid import FIGURES, TABLES
+from experiments.cli import thesis
+from experiments.reports import comparison, figures, page, publication, summary
+from experiments.reports.outcomes import Outcome, read_outcomes
+from experiments.thesis import grid
+from experiments.thesis.contradictions import CONTRADICTIONS
+from experiments.thesis.grid import FIGURES, TABLES
 from made_up_results import write_folder
 
 SEEDS = (0, 1)
 TARGET = "InvertedPendulum"
 
-# As `experiments.results` gives them.
+# As `experiments.reports.outcomes` gives them.
 Share = namedtuple("Share", "threshold scaled task known not_novel correct right_task")
 Classification = namedtuple("Classification", "table samples feature_size shares")
 
@@ -60,18 +63,18 @@ def root(tmp_path):
 def classification(monkeypatch):
     """What latent task classification gives: nothing, unless a test puts tables in here."""
     found = {}
-    monkeypatch.setattr(
-        results,
-        "read_classification",
-        lambda root, table, seeds=grid.SEEDS: found.get(table.name),
-        raising=False,
-    )
+    for module in (page, publication):
+        monkeypatch.setattr(
+            module,
+            "read_classification",
+            lambda root, table, seeds=grid.SEEDS: found.get(table.name),
+        )
     return found
 
 
 def entries(root, name="table-7"):
     table = TABLES[name]
-    outcomes = results.read_outcomes(root, grid.shown(table, SEEDS))
+    outcomes = read_outcomes(root, grid.shown(table, SEEDS))
     return comparison.compare(table, outcomes, SEEDS)
 
 
@@ -135,7 +138,7 @@ def test_curves_end_where_the_slowest_run_that_has_begun_is(tmp_path):
     write_folder(root, "one", [one], rising)
     write_folder(root, "other", [other], rising, done=3)
     missing = grid.baseline("bullet", TARGET, 2)
-    outcomes = results.read_outcomes(root, [one, other, missing])
+    outcomes = read_outcomes(root, [one, other, missing])
     steps, returns = comparison.curves(list(outcomes.values()), TARGET)
     assert steps.tolist() == [40, 80, 120]
     assert returns.tolist() == [[0, 10, 20], [10, 20, 30]]
@@ -146,7 +149,7 @@ def test_curves_end_where_the_slowest_run_that_has_begun_is(tmp_path):
 def test_targets_are_joined_each_on_its_own_scale():
     def group(target, base, transfer):
         def entry(sources, scores):
-            outcome = results.Outcome(baselines()[0], (1,), {}, 1, 1)
+            outcome = Outcome(baselines()[0], (1,), {}, 1, 1)
             return comparison.Entry(target, sources, None, (outcome,), 1, None, scores)
 
         return {
@@ -251,7 +254,7 @@ def test_a_meta_models_table_has_a_row_for_each_target_and_its_baseline(tmp_path
 
 
 def test_a_single_seed_has_numbers_and_no_verdict(root):
-    outcomes = results.read_outcomes(root, grid.shown(TABLES["table-7"], SEEDS[:1]))
+    outcomes = read_outcomes(root, grid.shown(TABLES["table-7"], SEEDS[:1]))
     sheet = publication.returns_sheet(TABLES["table-7"], outcomes, SEEDS[:1], None)
     box = sheet.rows[0][1][0]
     assert box.complete and box.verdict is None
@@ -342,7 +345,7 @@ def test_learning_curves_are_drawn_with_incomplete_ones_labelled(root, tmp_path)
 def test_curves_are_the_mean_over_seeds_with_their_deviation(root):
     from matplotlib.figure import Figure
 
-    outcomes = results.read_outcomes(root, baselines())
+    outcomes = read_outcomes(root, baselines())
     axis = Figure().subplots()
     curve = figures.Curve("baseline", figures.BASELINE, tuple(baselines()))
     figures._draw_curve(axis, curve, TARGET, list(outcomes.values()))
@@ -499,8 +502,8 @@ def test_pictures_of_tasks_without_their_simulator_leave_a_note(
     ],
 )
 def test_tasks_of_one_title_are_told_apart_by_their_names(tasks, called):
-    summaries = [report.Summary("seed", task, 1, 1, 1, (1.0, 0.0), (1.0, 0.0)) for task in tasks]
-    rows = report.table(summaries).splitlines()[2:]
+    summaries = [summary.Summary("seed", task, 1, 1, 1, (1.0, 0.0), (1.0, 0.0)) for task in tasks]
+    rows = summary.table(summaries).splitlines()[2:]
     assert [row.split()[:2] for row in rows] == [["seed", name] for name in called]
 
 
@@ -508,7 +511,7 @@ def test_tables_of_both_simulators_stand_beside_one_another(root, drawn):
     write_folder(root, "other", [grid.baseline("brax", TARGET, 0)], rising)
     for backend in ("bullet", "brax"):
         table = grid.on_backend(TABLES["table-7"], backend)
-        grid_commands._write([table], root, SEEDS, backend)
+        thesis._write([table], root, SEEDS, backend)
     for folder, baseline, simulator in [
         ("report", " 20 ± 12 |", "PyBullet"),
         ("report-brax", "4 of 8 evaluations", "Brax"),

@@ -5,14 +5,15 @@ import math
 import tomllib
 from collections import Counter
 from fnmatch import fnmatch
+from pathlib import Path
 
 import pytest
 
 from dreamer_jax.files import read_json
-from experiments import grid, published
-from experiments.contradictions import CONTRADICTIONS
-from experiments.page import STYLE
-from experiments.published import PATH, classification, records, returns
+from experiments.reports.page import STYLE
+from experiments.thesis import grid, published
+from experiments.thesis.contradictions import CONTRADICTIONS
+from experiments.thesis.published import PATH, classification, records, returns
 
 KEYS = [
     "table",
@@ -207,6 +208,8 @@ def test_each_contradiction_says_what_where_and_what_is_done():
 
 @pytest.mark.parametrize("path", [PATH, STYLE])
 def test_what_the_report_reads_is_packaged(path):
-    settings = tomllib.loads((PATH.parent.parent / "pyproject.toml").read_text())
-    patterns = settings["tool"]["setuptools"]["package-data"]["experiments"]
+    root = Path(__file__).parent.parent
+    settings = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]
+    package = ".".join(path.parent.relative_to(root).parts)
+    patterns = settings["package-data"][package]
     assert path.exists() and any(fnmatch(path.name, pattern) for pattern in patterns)

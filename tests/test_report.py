@@ -6,20 +6,24 @@ import pytest
 
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
-from experiments import report
 from experiments.__main__ import main
-from experiments.levels import draw_levels
-from experiments.spec import RunSpec
+from experiments.methods.fractional import FractionalTransfer
+from experiments.methods.scratch import Scratch
+from experiments.reports import summary
+from experiments.reports.levels import draw_levels
+from experiments.runs.spec import RunSpec
+
+SCRATCH = Scratch()
 
 
 @pytest.fixture
 def folder(tmp_path):
     """Writes a run whose every evaluation of a task gives that task's return."""
 
-    def make(name, returns, **settings):
+    def make(name, returns, method=SCRATCH):
         directory = tmp_path / name
         directory.mkdir(parents=True)
-        spec = RunSpec(tuple(returns), (0, 1), preset("debug"), **settings)
+        spec = RunSpec(tuple(returns), (0, 1), preset("debug"), method)
         write_json_atomically(directory / "run.json", {"spec": spec.to_dict()})
         rows = [
             {"kind": "evaluation", "member": number, "seed": member.seed, "label": member.label}
@@ -43,7 +47,7 @@ def drawn(monkeypatch):
         panels.update({title: [curve.text for curve in curves] for title, curves in found.items()})
         return [stem.with_suffix(".png")]
 
-    monkeypatch.setattr(report, "_draw", note)
+    monkeypatch.setattr(summary, "_draw", note)
     return panels
 
 
@@ -51,9 +55,9 @@ def test_one_task_on_two_simulators_shares_a_panel(folder, monkeypatch):
     panels = drawn(monkeypatch)
     ours = folder("ours", {"bullet/hopper": 3.0})
     other = folder("other", {"brax/hopper": 5.0})
-    report.plot_comparison([ours, other], "picture")
+    summary.plot_comparison([ours, other], "picture")
     assert panels == {"Hopper": ["ours", "other"]}
-    summaries = report.compare([ours, other])
+    summaries = summary.compare([ours, other])
     assert [(s.label, s.task, s.overall) for s in summaries] == [
         ("ours", "bullet/hopper", (3.0, 0.0)),
         ("other", "brax/hopper", (5.0, 0.0)),
@@ -64,9 +68,11 @@ def test_curves_are_told_apart_by_folder_label_and_simulator(folder, tmp_path, m
     panels = drawn(monkeypatch)
     both = folder("a/run", {"bullet/hopper": 0.0, "brax/hopper": 0.0, "brax/ant": 0.0})
     targets = folder(
-        "b/run", {"brax/ant": 0.0}, sources=("source",), omegas=(0.0, 0.2), baseline=True
+        "b/run",
+        {"brax/ant": 0.0},
+        FractionalTransfer(sources=("source",), omegas=(0.0, 0.2), baseline=True),
     )
-    report.plot_comparison([both, targets], "picture")
+    summary.plot_comparison([both, targets], "picture")
     a, b = map(str, (both, targets))
     assert panels == {
         "Hopper": [f"{a}, bullet/hopper", f"{a}, brax/hopper"],

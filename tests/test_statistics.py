@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
-from experiments import statistics
-from experiments.statistics import Estimate
+from experiments.reports import statistics
+from experiments.reports.statistics import Estimate
 
 SCORES = st.lists(st.integers(-1000, 1000).map(float), min_size=2, max_size=5).map(np.array)
 

@@ -9,13 +9,13 @@ import pytest
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from envs import SimulatorError
-from experiments import estimate
-from experiments import sweep as sweeps
-from experiments.estimate import Speed, plan_table
-from experiments.graph import plan_runs
-from experiments.grid import TABLES, closure, shown
-from experiments.results import folders
-from experiments.sweep import carry_out_runs
+from experiments.runs.folder import folders
+from experiments.thesis import estimate
+from experiments.thesis import sweep as sweeps
+from experiments.thesis.estimate import Speed, plan_table
+from experiments.thesis.graph import plan_runs
+from experiments.thesis.grid import TABLES, closure, shown
+from experiments.thesis.sweep import carry_out_runs
 from runs import CONFIG, finish
 
 TWO_TARGETS = (
@@ -260,7 +260,7 @@ def test_a_plan_of_what_is_done_needs_no_measurement(tmp_path):
 def test_runs_of_every_method_can_be_estimated():
     hopper = dataclasses.replace(TABLES["table-16"], targets=("Hopper",))
     runs = plan_runs(shown(hopper), CONFIG, "nowhere")
-    assert {run.spec.method for run in runs} == {"fractional", "uae", "meta"}
+    assert {run.spec.method.NAME for run in runs} == {"scratch", "uae", "meta"}
     ticks = {task: 0.01 for run in runs for task in run.spec.tasks}
     speed = dataclasses.replace(SPEED, tick_seconds=ticks, tick_compile_seconds=ticks)
     assert all(estimate.estimate(run, speed).memory > 0 for run in runs)

@@ -10,11 +10,13 @@ import pytest
 import envs
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
-from experiments import grid, grid_commands, latent_tables
 from experiments.__main__ import main
-from experiments.graph import plan_runs
-from experiments.grid import TABLES, shown
-from experiments.results import folders, latents_folder, read_classification, read_outcomes
+from experiments.cli import thesis
+from experiments.reports.outcomes import read_classification, read_outcomes
+from experiments.runs.folder import folders, latents_folder
+from experiments.thesis import grid, latent_tables
+from experiments.thesis.graph import plan_runs
+from experiments.thesis.grid import TABLES, shown
 from runs import CONFIG, finish, write_run
 
 pytest.importorskip("pybullet")
@@ -44,7 +46,7 @@ def root(demo):
 def written(monkeypatch):
     """The tables and figures that were to be written, which here is only noted."""
     entries = []
-    monkeypatch.setattr(grid_commands, "_write", lambda some, *_: entries.extend(some))
+    monkeypatch.setattr(thesis, "_write", lambda some, *_: entries.extend(some))
     return entries
 
 
@@ -99,16 +101,16 @@ def test_what_was_transferred_is_written_leaf_by_leaf(root):
 
 def test_runs_say_where_their_sources_are_from_the_folder_of_all(root):
     header = read_json(root / TARGETS / "run.json")
-    assert header["spec"]["sources"] == [SOURCE]
+    assert header["spec"]["method"]["sources"] == [SOURCE]
     assert header["revision"] and header["versions"]["jax"]
     assert len(read_json(root / TARGETS / "cells.json")) == 8
 
 
 def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(demo, root, written):
     before = metrics(root)
-    sweep = grid_commands.Sweep("debug", (0, 1), results=demo[0], config=CONFIG)
+    sweep = thesis.Sweep("debug", (0, 1), results=demo[0], config=CONFIG)
     figure = dataclasses.replace(grid.FIGURES["figure-36"], tasks=("InvertedPendulum",))
-    assert grid_commands._make([grid.DEMO, figure], sweep) == 0
+    assert thesis._make([grid.DEMO, figure], sweep) == 0
     assert written == [grid.DEMO, figure]
     assert metrics(root) == before
     outcomes = read_outcomes(root, [*shown(grid.DEMO, (0, 1)), *shown(figure, (0, 1))])
@@ -123,12 +125,14 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, 
     # Made in a moment: what is trained here is the population of targets.
     for seed, run in enumerate(sources):
         spec = run.spec
-        if spec.sources:
-            spec = dataclasses.replace(spec, sources=tuple(str(root / x) for x in spec.sources))
+        if spec.method.sources:
+            sources = tuple(str(root / name) for name in spec.method.sources)
+            method = dataclasses.replace(spec.method, sources=sources)
+            spec = dataclasses.replace(spec, method=method)
         finish(run, root)
         write_run(root / run.name, spec, seed, keep=True)
-    sweep = grid_commands.Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)
-    assert grid_commands._make([META], sweep) == 0
+    sweep = thesis.Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)
+    assert thesis._make([META], sweep) == 0
     assert len(targets.cells) == 2
     outcomes = read_outcomes(root, shown(META, (0, 1)))
     assert {outcome.state for outcome in outcomes.values()} == {"complete"}
@@ -160,9 +164,9 @@ def classified(tmp_path_factory):
 
 def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatch, written):
     monkeypatch.setattr(latent_tables, "gather", None)
-    sweep = grid_commands.Sweep("debug", results=classified.parent, config=CONFIG)
+    sweep = thesis.Sweep("debug", results=classified.parent, config=CONFIG)
     entries = [TABLES[f"table-{number}"] for number in (13, 14, 15)]
-    assert grid_commands._make(entries, sweep) == 0
+    assert thesis._make(entries, sweep) == 0
     for entry in entries:
         found = read_classification(classified, entry)
         assert (found.samples, found.feature_size) == (100, 12)

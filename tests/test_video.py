@@ -8,7 +8,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from dreamer_jax.video import tile, write_video
+from dreamer_jax.video import captioned, tile, write_video
 
 
 def frames(count=6, height=32, width=48):
@@ -102,3 +102,21 @@ def test_tiles_stand_side_by_side_with_a_border_between():
     np.testing.assert_array_equal(tile(videos, border=0)[0, 0, :, 0], np.repeat([10, 20, 30], 6))
     with pytest.raises(ValueError, match=r"\[4, 5, 6, 3\], expected \[videos, frames"):
         tile(videos[0])
+
+
+def test_captions_stand_above_enlarged_videos_on_white():
+    videos = np.stack([frames(height=32, width=32), 255 - frames(height=32, width=32)])
+    shown = captioned(videos, ["one", "another\nwith two lines"])
+    # Two lines of 22 pixels and a border of 8 above, 8 below; 8 around each of two times 256.
+    assert shown.shape == (6, 52 + 256 + 8, 8 + 2 * (256 + 8), 3)
+    assert (shown[:, 52 : 52 + 256, 8:264] == videos[0].repeat(8, axis=1).repeat(8, axis=2)).all()
+    assert (shown[:, 52 : 52 + 256, 272:528] == videos[1].repeat(8, axis=1).repeat(8, axis=2)).all()
+    assert (shown[:, 52:, 264:272] == 255).all() and (shown[:, :52] < 128).any()
+    # A caption stands above its own video.
+    assert (captioned(videos, ["one", ""])[:, :30, 264:] == 255).all()
+
+
+@pytest.mark.parametrize("captions", ([], ["one"], ["one", "two", "three"]))
+def test_captions_that_are_not_one_for_each_video_are_refused(captions):
+    with pytest.raises(ValueError, match=rf"\[2, 6, 32, 48, 3\] and there are {len(captions)}"):
+        captioned(np.stack([frames(), frames()]), captions)

@@ -1,7 +1,7 @@
 """Move knowledge between pytrees of parameters: select leaves, operate on them, say what happened.
 
 Works on any pytree of arrays (Flax linen and NNX, Equinox, Haiku, Optax states, dataclasses, plain
-containers), alone or stacked as a population, under ``jit`` and ``vmap``.
+containers), alone or stacked as a population, under `jit` and `vmap`.
 
 Axis letters, used everywhere: P population member, N source, M feature, S sample.
 """

@@ -51,15 +51,16 @@ OPERATIONS: Operations = {
 def source_leaves(
     plan: Plan, target: PyTree, source: PyTree, *, operations: Operations = OPERATIONS
 ) -> dict[str, Any]:
-    """The leaves of a source that the plan reads, as a flat ``{path: array}``.
+    """The leaves of a source that the plan reads, as a flat `{path: array}`.
 
     Sources that differ where the plan does not look (another action size) are alike in these, so
-    they can be stacked; the result is a valid source for :func:`apply`. For plans of one source.
+    they can be stacked; the result is a valid source for `apply`. For plans of one source.
 
     Raises:
-        ValueError: as :func:`transfer.claims`, or a leaf the plan reads that the source has not.
+      ValueError: as `transfer.claims`, or a leaf the plan reads that the source has not.
     """
-    flat, names = flatten(source), {}
+    flat = flatten(source)
+    names: dict[str, None] = {}
     for path, rule in claims(plan, target).items():
         if "source" in _signature(rule, operations):
             names |= dict.fromkeys(source_places(rule, path, flat))
@@ -81,31 +82,31 @@ def apply(
     """Carry out a plan.
 
     Args:
-        plan: the plan.
-        target: the tree to change; never altered. If it has shapes in place of arrays
-            (``jax.ShapeDtypeStruct``, as from ``jax.eval_shape``), this is a dry run: everything
-            but values is checked, and the new tree has shapes too.
-        source: the tree that knowledge comes from; where rules name their sources, a mapping
-            ``{name: tree}``. A file from :func:`transfer.open_file` is read leaf by leaf.
-        key: one PRNG key, for the operations that draw. Leaves draw independently.
-        population: whether the target's leaves are stacked on a leading axis P. Source leaves may
-            be stacked too or shared by all members; parameters may be scalars or [P]; each member
-            gets a key of its own; the report has a row of numbers for each member.
-        strict: whether a leaf of the source that no rule reads is an error. Otherwise it is listed
-            in the report's ``unread``.
-        measure: whether the report has norms and cosines, which take a pass over all leaves.
-        operations: what the names in the plan mean; extend ``OPERATIONS`` with your own.
-        **parameters: values for what the rules leave open, such as ``omega=0.2``; they go to
-            every rule whose operation has a parameter of this name that the plan does not set.
-            A value may be a mapping ``{path, branch or pattern: number}`` or a tree, which gives
-            each leaf its own, traced and differentiable too.
+      plan: the plan.
+      target: the tree to change; never altered. If it has shapes in place of arrays
+        (`jax.ShapeDtypeStruct`, as from `jax.eval_shape`), this is a dry run: everything
+        but values is checked, and the new tree has shapes too.
+      source: the tree that knowledge comes from; where rules name their sources, a mapping
+        `{name: tree}`. A file from `transfer.open_file` is read leaf by leaf.
+      key: one PRNG key, for the operations that draw. Leaves draw independently.
+      population: whether the target's leaves are stacked on a leading axis P. Source leaves may
+        be stacked too or shared by all members; parameters may be scalars or [P]; each member
+        gets a key of its own; the report has a row of numbers for each member.
+      strict: whether a leaf of the source that no rule reads is an error. Otherwise it is listed
+        in the report's `unread`.
+      measure: whether the report has norms and cosines, which take a pass over all leaves.
+      operations: what the names in the plan mean; extend `OPERATIONS` with your own.
+      **parameters: values for what the rules leave open, such as `omega=0.2`; they go to
+        every rule whose operation has a parameter of this name that the plan does not set.
+        A value may be a mapping `{path, branch or pattern: number}` or a tree, which gives
+        each leaf its own, traced and differentiable too.
 
     Returns:
-        The new tree and a :class:`Report`. Under ``vmap`` both get a leading axis.
+      The new tree and a `Report`. Under `vmap` both get a leading axis.
 
     Raises:
-        ValueError: as :func:`transfer.claims`; or a parameter, key or source that is missing or
-            unused; or as the operations.
+      ValueError: as `transfer.claims`; or a parameter, key or source that is missing or
+        unused; or as the operations.
     """
     work = _prepare(
         plan, target, source, key, population, strict, operations=operations, given=parameters
@@ -146,14 +147,14 @@ def stream(
 ) -> tuple[PyTree, Report]:
     """Carry out a plan leaf by leaf, with no more of the sources in memory than one leaf reads.
 
-    As :func:`apply`, but for two things. Each operation sees one leaf at a time, as
-    ``{path: array}``. And the target may have shapes in place of arrays (``jax.ShapeDtypeStruct``)
-    where the operation does not read the target's values: ``copy``, ``take``, ``crop``, ``pad``
-    with a ``fill``, ``reinitialise`` and ``average``. An array is made for each, on the devices
-    that the shape's ``sharding`` names, so that neither a whole target nor a whole source exists.
+    As `apply`, but for two things. Each operation sees one leaf at a time, as
+    `{path: array}`. And the target may have shapes in place of arrays (`jax.ShapeDtypeStruct`)
+    where the operation does not read the target's values: `copy`, `take`, `crop`, `pad`
+    with a `fill`, `reinitialise` and `average`. An array is made for each, on the devices
+    that the shape's `sharding` names, so that neither a whole target nor a whole source exists.
 
     Raises:
-        ValueError: as :func:`apply`; or a shape of the target whose operation reads its values.
+      ValueError: as `apply`; or a shape of the target whose operation reads its values.
 
     >>> plan = Plan((Rule("**", "copy"),))
     >>> target = {"w": jax.ShapeDtypeStruct((2,), jnp.bfloat16)}
@@ -226,11 +227,12 @@ def _prepare(
     members = populations.size(target) if population else None
     if key is not None:
         key = check_key(key)
-        if population and key.ndim == key_ndim(key):
+        if members is not None and key.ndim == key_ndim(key):
             key = jax.random.split(key, members)
     sources = flat_sources(plan, source)
     rules = tuple({id(rule): rule for rule in claimed.values()}.values())
-    work, arguments, read = [], [], {name: set() for name in sources}
+    work, arguments = [], []
+    read: dict[str | None, set[str]] = {name: set() for name in sources}
     for rule in rules:
         mine = tuple(path for path in before if claimed[path] is rule)
         signature = _signature(rule, operations)
@@ -370,7 +372,7 @@ class _PerLeaf(dict):
 
 
 def _resolved(rule, name, value, mine, before, operation) -> Any:
-    """A parameter that differs between leaves as ``{path: number}``; any other as it is."""
+    """A parameter that differs between leaves as `{path: number}`; any other as it is."""
     if is_gradient(value):
         return _PerLeaf(_gradient(rule, name, value, mine))
     value = _plain(value)
@@ -390,13 +392,14 @@ def _plain(value: Any) -> Any:
 
 
 def _gradient(rule: Rule, name: str, value: Mapping, mine: Sequence[str]) -> dict[str, Any]:
-    """The number of each leaf where ``values`` are spread over a captured part."""
-    depths = {path: rule.captured(path).get(value["over"]) for path in mine}
-    if None in depths.values():
+    """The number of each leaf where `values` are spread over a captured part."""
+    captured = {path: rule.captured(path) for path in mine}
+    if any(value["over"] not in parts for parts in captured.values()):
         raise ValueError(
             f"{name} of the rule '{rule}' is spread over {{{value['over']}}}, which its pattern "
             "does not capture."
         )
+    depths = {path: parts[value["over"]] for path, parts in captured.items()}
     order = sorted(set(depths.values()), key=natural)
     values = value["values"]
     knots = [jnp.asarray(knot, jnp.float32) for knot in values] if np.ndim(values) else []

@@ -27,7 +27,7 @@ class DamagedFile(ValueError):
 class ArrayFile(Leaves):
     """Arrays in a file, read when they are asked for.
 
-    A subclass has ``shapes``, ``__iter__`` and ``read``.
+    A subclass has `shapes`, `__iter__` and `read`.
     """
 
     def __init__(self, path: Path, max_bytes: int | None):
@@ -43,8 +43,8 @@ class ArrayFile(Leaves):
         """Some of the arrays.
 
         Raises:
-            ValueError: a name that is not in the file, a damaged file, or arrays of more bytes than
-                the limit.
+          ValueError: a name that is not in the file, a damaged file, or arrays of more bytes than
+            the limit.
         """
         raise NotImplementedError
 
@@ -74,7 +74,7 @@ class ArrayFile(Leaves):
 
 @contextmanager
 def damage(path: Path, what: str = "") -> Iterator[None]:
-    """Whatever goes wrong inside is a :class:`DamagedFile` that names the file."""
+    """Whatever goes wrong inside is a `DamagedFile` that names the file."""
     try:
         yield
     except DamagedFile:
@@ -106,15 +106,17 @@ def check_size(file: ArrayFile, names: Iterable[str]) -> None:
 
 def _bytes(count: int) -> str:
     """A number of bytes for people."""
-    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
-        if count < 1024 or unit == "TiB":
-            return f"{count:.4g} {unit}"
-        count /= 1024
+    amount = float(count)
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if amount < 1024:
+            return f"{amount:.4g} {unit}"
+        amount /= 1024
+    return f"{amount:.4g} TiB"
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file that takes the place of ``path`` when, and only when, it is complete."""
+    """A temporary file that takes the place of `path` when, and only when, it is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     os.close(handle)

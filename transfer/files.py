@@ -1,13 +1,13 @@
-"""Parameters in files: ``.npz``, ``.safetensors`` and Orbax checkpoints, under '/'-joined names.
+"""Parameters in files: `.npz`, `.safetensors` and Orbax checkpoints, under '/'-joined names.
 
-:func:`load` gives a flat ``{path: array}``, which every operation and plan takes as a source:
-``transfer.copy(target, load("source.npz", "encoder/**"), where="encoder/**")``. :func:`open_file`
+`load` gives a flat `{path: array}`, which every operation and plan takes as a source:
+`transfer.copy(target, load("source.npz", "encoder/**"), where="encoder/**")`. `open_file`
 gives the same without reading it: each array is read when it is asked for. No structure is stored
 but the names, so any tree with the same paths can take the arrays.
 
 Nothing that is loaded can execute code: pickles are refused, and no class is looked up by name.
 What a file says of itself (shapes, sizes, offsets) is compared with its size before any memory is
-asked for, and whatever is wrong with it is a ``ValueError`` that names the file.
+asked for, and whatever is wrong with it is a `ValueError` that names the file.
 """
 
 import os
@@ -29,16 +29,16 @@ def save(path: str | os.PathLike, tree: PyTree, where: Where = None) -> None:
     """Write the arrays of a tree, or those selected, to a file.
 
     Args:
-        path: ends in ``.npz`` or ``.safetensors``, which are replaced if they exist; without a
-            suffix it is a folder for a new Orbax checkpoint (which needs the package
-            orbax-checkpoint). A ``.safetensors`` file holds a SHA-256 of every array beside the
-            names, which :func:`load` compares.
-        tree: any pytree.
-        where: the leaves to write; all by default.
+      path: ends in `.npz` or `.safetensors`, which are replaced if they exist; without a
+        suffix it is a folder for a new Orbax checkpoint (which needs the package
+        orbax-checkpoint). A `.safetensors` file holds a SHA-256 of every array beside the
+        names, which `load` compares.
+      tree: any pytree.
+      where: the leaves to write; all by default.
 
     Raises:
-        ValueError: another suffix, leaves that the format cannot hold, or no leaves.
-        FileExistsError: an Orbax checkpoint, or anything else, is there already.
+      ValueError: another suffix, leaves that the format cannot hold, or no leaves.
+      FileExistsError: an Orbax checkpoint, or anything else, is there already.
     """
     path = Path(path)
     write = _WRITERS.get(path.suffix.lower())
@@ -59,19 +59,19 @@ def load(
     """Read arrays by name; what is not selected is not read.
 
     Args:
-        path: as in :func:`save`; the format is told by the suffix, and a folder is an Orbax
-            checkpoint.
-        *patterns: which names to read (see :func:`transfer.select`); all by default.
-        max_bytes: the most memory that the arrays read may take. By default 20 times what the file
-            takes on disk, and 256 MiB at least, which only compressed files can exceed.
+      path: as in `save`; the format is told by the suffix, and a folder is an Orbax
+        checkpoint.
+      *patterns: which names to read (see `transfer.select`); all by default.
+      max_bytes: the most memory that the arrays read may take. By default 20 times what the file
+        takes on disk, and 256 MiB at least, which only compressed files can exceed.
 
     Returns:
-        ``{path: array}``, with the dtypes that were written.
+      `{path: array}`, with the dtypes that were written.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        ValueError: the suffix is unknown; the file is damaged, holds Python objects, or takes more
-            than ``max_bytes``; or a pattern matches no name in it.
+      FileNotFoundError: nothing is there.
+      ValueError: the suffix is unknown; the file is damaged, holds Python objects, or takes more
+        than `max_bytes`; or a pattern matches no name in it.
     """
     with open_file(path, max_bytes=max_bytes) as file:
         names = list(file)
@@ -82,16 +82,16 @@ def load(
 def open_file(path: str | os.PathLike, *, max_bytes: int | None = None) -> ArrayFile:
     """The arrays of a file as a mapping that reads each when it is asked for.
 
-    It is a source for every operation and plan; :func:`transfer.apply` and
-    :func:`transfer.stream` take it leaf by leaf. Close it, or use it in ``with``.
+    It is a source for every operation and plan; `transfer.apply` and
+    `transfer.stream` take it leaf by leaf. Close it, or use it in `with`.
 
     Args:
-        path: as for :func:`load`.
-        max_bytes: as for :func:`load`, of each array and of each call that reads several.
+      path: as for `load`.
+      max_bytes: as for `load`, of each array and of each call that reads several.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        ValueError: the suffix is unknown, or the file is damaged.
+      FileNotFoundError: nothing is there.
+      ValueError: the suffix is unknown, or the file is damaged.
     """
     path = Path(path)
     if not path.exists():
@@ -150,7 +150,7 @@ def _write_orbax(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _nest(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """``{"a/b": x}`` as ``{"a": {"b": x}}``."""
+    """`{"a/b": x}` as `{"a": {"b": x}}`."""
     nested: dict[str, Any] = {}
     for name, array in arrays.items():
         *branches, last = name.split("/")
@@ -208,7 +208,8 @@ class _OrbaxFolder(ArrayFile):
             restored = checkpointer.restore(
                 self._path.absolute(),
                 args=ocp.args.PyTreeRestore(
-                    item=structure.unflatten(wanted), restore_args=structure.unflatten(kind)
+                    item=jax.tree.unflatten(structure, wanted),
+                    restore_args=jax.tree.unflatten(structure, kind),
                 ),
             )
             leaves = jax.tree.leaves(restored)

@@ -1,11 +1,11 @@
 """Leaves that do not train, or train later or slower, as Optax transforms.
 
-All of these wrap an Optax optimiser and take selections as ``select`` does: a mask, a pattern or
+All of these wrap an Optax optimiser and take selections as `select` does: a mask, a pattern or
 several patterns over the paths of the parameters. The optimiser that is wrapped sees only the
 leaves it trains, so that a global norm inside it is the norm of those.
 
-Freezing has three prices, each avoidable: the update (:func:`freeze`), the optimiser's memory
-(:func:`freeze` too) and the gradient (:func:`partition` or :func:`stop_gradient`).
+Freezing has three prices, each avoidable: the update (`freeze`), the optimiser's memory
+(`freeze` too) and the gradient (`partition` or `stop_gradient`).
 """
 
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ def _no_update() -> optax.GradientTransformation:
 
 
 def _labels(label: Callable[[PyTree], Mapping[str, Any]]) -> Callable[[PyTree], PyTree]:
-    """A function from parameters to a tree of labels, for ``optax.partition``."""
+    """A function from parameters to a tree of labels, for `optax.partition`."""
 
     def tree_of_labels(params: PyTree) -> PyTree:
         return unflatten(params, label(params))
@@ -46,11 +46,11 @@ def freeze(
     no memory for them.
 
     Args:
-        optimizer: what trains the other leaves.
-        where: the frozen leaves.
+      optimizer: what trains the other leaves.
+      where: the frozen leaves.
 
     Raises:
-        ValueError: at ``init``, as :func:`transfer.select`.
+      ValueError: at `init`, as `transfer.select`.
 
     >>> params = {"encoder": jnp.ones(2), "head": jnp.ones(2)}
     >>> optimizer = freeze(optax.sgd(0.5), "encoder")
@@ -99,7 +99,7 @@ def _waiting(before: PyTree, after: PyTree) -> PyTree:
 def _delayed(
     optimizer: optax.GradientTransformation, start: Any, restart: bool
 ) -> optax.GradientTransformationExtraArgs:
-    """An optimiser that begins, from its initial state, at step ``start``."""
+    """An optimiser that begins, from its initial state, at step `start`."""
     optimizer = optax.with_extra_args_support(optimizer)
 
     def init(params):
@@ -128,21 +128,21 @@ def unfreeze_gradually(
     that Adam's bias correction is right when it begins). All leaves that begin at one step are one
     group with an optimiser of their own: what couples leaves, such as a global norm, sees the
     group. To couple all leaves put it outside:
-    ``optax.chain(optax.clip_by_global_norm(1.0), unfreeze_gradually(optax.adam(1e-3), ...))``.
+    `optax.chain(optax.clip_by_global_norm(1.0), unfreeze_gradually(optax.adam(1e-3), ...))`.
 
     Args:
-        optimizer: what trains each group.
-        starts: pattern, or a tuple of patterns as :func:`transfer.select` takes them -> the first
-            step (0 is the first of all) at which its leaves train. Leaves that no pattern names
-            train from the first step on.
-        schedules: whether a schedule inside the optimiser (a learning rate that decays) counts
-            all steps of the training, so that late leaves begin with the rate of the moment, or
-            restarts for each group with its first step. Known are those of Optax
-            (``optax.scale_by_schedule``, a rate given as a schedule, ``optax.inject_hyperparams``).
+      optimizer: what trains each group.
+      starts: pattern, or a tuple of patterns as `transfer.select` takes them -> the first
+        step (0 is the first of all) at which its leaves train. Leaves that no pattern names
+        train from the first step on.
+      schedules: whether a schedule inside the optimiser (a learning rate that decays) counts
+        all steps of the training, so that late leaves begin with the rate of the moment, or
+        restarts for each group with its first step. Known are those of Optax
+        (`optax.scale_by_schedule`, a rate given as a schedule, `optax.inject_hyperparams`).
 
     Raises:
-        ValueError: a start that is no step; at ``init``, where a pattern matches nothing or two
-            match one leaf.
+      ValueError: a start that is no step; at `init`, where a pattern matches nothing or two
+        match one leaf.
 
     >>> params = {"body": jnp.ones(1), "head": jnp.ones(1)}
     >>> optimizer = unfreeze_gradually(optax.sgd(0.5), {"body": 1})
@@ -176,13 +176,13 @@ def scale_learning_rates(
     """An optimiser whose updates of some leaves are multiplied by a factor.
 
     Args:
-        optimizer: the optimiser; its update of a leaf is scaled, whatever it consists of.
-        multipliers: pattern, or a tuple of patterns as :func:`transfer.select` takes them ->
-            factor, a scalar that may be traced. Leaves that no pattern names have factor 1. For a
-            factor of 0 use :func:`freeze`, which keeps no memory.
+      optimizer: the optimiser; its update of a leaf is scaled, whatever it consists of.
+      multipliers: pattern, or a tuple of patterns as `transfer.select` takes them ->
+        factor, a scalar that may be traced. Leaves that no pattern names have factor 1. For a
+        factor of 0 use `freeze`, which keeps no memory.
 
     Raises:
-        ValueError: at the first update, where a pattern matches nothing or two match one leaf.
+      ValueError: at the first update, where a pattern matches nothing or two match one leaf.
 
     >>> params = {"body": jnp.ones(1), "head": jnp.ones(1)}
     >>> optimizer = scale_learning_rates(optax.sgd(0.5), {"body": 0.1})
@@ -217,10 +217,10 @@ def _claim(tree: PyTree, values: Mapping[Any, Any], *, default: Any) -> dict[str
 
 
 def partition(tree: PyTree, where: Where) -> tuple[PyTree, PyTree]:
-    """A tree in two: the selected leaves and the rest, each with ``None`` for the other's.
+    """A tree in two: the selected leaves and the rest, each with `None` for the other's.
 
     A gradient with respect to one part costs nothing for the other:
-    ``jax.grad(lambda trained: loss(combine(trained, frozen)))(trained)``. What is not an array
+    `jax.grad(lambda trained: loss(combine(trained, frozen)))(trained)`. What is not an array
     goes with the rest.
 
     >>> frozen, trained = partition({"encoder": jnp.ones(1), "head": jnp.ones(1)}, "encoder")
@@ -231,10 +231,10 @@ def partition(tree: PyTree, where: Where) -> tuple[PyTree, PyTree]:
 
 
 def combine(*parts: PyTree) -> PyTree:
-    """The tree that :func:`partition` split.
+    """The tree that `partition` split.
 
     Raises:
-        ValueError: two parts hold the same leaf, or differ in structure.
+      ValueError: two parts hold the same leaf, or differ in structure.
 
     >>> combine({"a": 1.0, "b": None}, {"a": None, "b": 2.0})
     {'a': 1.0, 'b': 2.0}

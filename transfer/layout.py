@@ -1,21 +1,21 @@
 """The layout of a leaf as data: how arrays of a foreign checkpoint become one array of the target.
 
-A *layout* is a sequence of steps, each ``{name: arguments}`` or a bare name. The first step of a
+A *layout* is a sequence of steps, each `{name: arguments}` or a bare name. The first step of a
 rule that reads several arrays joins them; each later one changes the array:
 
 =================================================  ================================================
-``{"stack": {"axis": 0}}``                         several arrays along a new axis
-``{"concatenate": {"axis": 0}}``                   several arrays along an axis: q, k, v to one
-``"add"``                                          the sum of several: two biases to one
-``"transpose"``, ``{"transpose": [2, 1, 0]}``      all axes reversed, or in this order
-``{"reshape": [8, -1]}``                           another shape of as many numbers
-``{"split": {"axis": 0, "parts": 3, "index": 0}}`` one of equal parts: q from q, k, v
-``{"take": {"axis": 0, "index": "{i}"}}``          one slice; the axis goes: layer i of a stack
-``{"reorder": {"axis": 0, "blocks": [0, 2, 1]}}``  equal blocks in another order: gates of a cell
-``{"flip": {"axis": 0}}``                          backwards along an axis
+`{"stack": {"axis": 0}}`                         several arrays along a new axis
+`{"concatenate": {"axis": 0}}`                   several arrays along an axis: q, k, v to one
+`"add"`                                          the sum of several: two biases to one
+`"transpose"`, `{"transpose": [2, 1, 0]}`      all axes reversed, or in this order
+`{"reshape": [8, -1]}`                           another shape of as many numbers
+`{"split": {"axis": 0, "parts": 3, "index": 0}}` one of equal parts: q from q, k, v
+`{"take": {"axis": 0, "index": "{i}"}}`          one slice; the axis goes: layer i of a stack
+`{"reorder": {"axis": 0, "blocks": [0, 2, 1]}}`  equal blocks in another order: gates of a cell
+`{"flip": {"axis": 0}}`                          backwards along an axis
 =================================================  ================================================
 
-Numbers may be captured parts of the rule's pattern, written ``"{i}"``.
+Numbers may be captured parts of the rule's pattern, written `"{i}"`.
 """
 
 import re
@@ -58,7 +58,7 @@ def _reshape(array: Array, shape: Sequence[int]) -> Array:
 
 
 def _blocks(array: Array, axis: int, count: int) -> tuple[int, int]:
-    """The axis counted from the start, and the size of each of ``count`` equal blocks."""
+    """The axis counted from the start, and the size of each of `count` equal blocks."""
     if not -array.ndim <= axis < array.ndim:
         raise ValueError(f"there is no axis {axis}")
     axis %= array.ndim
@@ -115,7 +115,7 @@ def steps(layout: Any) -> tuple[Step, ...]:
     """The steps of a layout as (name, arguments).
 
     Raises:
-        ValueError: an unknown step, or one that is no name or mapping of one.
+      ValueError: an unknown step, or one that is no name or mapping of one.
 
     >>> steps(["transpose", {"reshape": [8, -1]}])
     (('transpose', None), ('reshape', [8, -1]))
@@ -164,13 +164,13 @@ def arrange(
     """One array of the target from the arrays that its rule reads.
 
     Args:
-        path: the target's leaf, for messages.
-        arrays: what was read, one array or several.
-        layout: the steps.
-        captures: what the captured parts of the rule's pattern stand for.
+      path: the target's leaf, for messages.
+      arrays: what was read, one array or several.
+      layout: the steps.
+      captures: what the captured parts of the rule's pattern stand for.
 
     Raises:
-        ValueError: several arrays and no step that joins them, or a step that does not fit.
+      ValueError: several arrays and no step that joins them, or a step that does not fit.
 
     >>> q, k = np.ones((2, 3)), np.zeros((2, 3))
     >>> arrange("qk", [q, k], [{"concatenate": {"axis": 0}}, "transpose"]).shape

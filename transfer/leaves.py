@@ -175,8 +175,8 @@ def check_casting(path: str, source: Array, target: Array, casting: str) -> None
     """Raise unless the source's values may be stored in the target's dtype.
 
     Raises:
-        ValueError: another kind of number under ``"same_kind"``, another dtype under ``"no"``;
-            or values that the target's dtype cannot hold (where they are concrete).
+      ValueError: another kind of number under `"same_kind"`, another dtype under `"no"`;
+        or values that the target's dtype cannot hold (where they are concrete).
     """
     if casting not in ("no", "same_kind", "unsafe"):
         raise ValueError(f"casting is 'no', 'same_kind' or 'unsafe'; got {casting!r}.")
@@ -261,7 +261,7 @@ def cast(path: str, result: Array, target: Array, *, casting: str = "same_kind")
 
 
 def _sharding(leaf: Array) -> jax.sharding.Sharding | None:
-    """Where a leaf lies, or is to lie; ``None`` for NumPy and inside traced functions."""
+    """Where a leaf lies, or is to lie; `None` for NumPy and inside traced functions."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf.sharding
     return leaf.sharding if isinstance(leaf, jax.Array) and is_concrete(leaf) else None
@@ -289,7 +289,7 @@ def beside(source: Array, target: Array) -> Array:
 
 
 def find_initializer(initializer: str | Mapping[str, Any] | Callable) -> Callable:
-    """An initializer from itself, its name, or ``{"name": ..., **arguments}``."""
+    """An initializer from itself, its name, or `{"name": ..., **arguments}`."""
     if callable(initializer):
         return initializer
     arguments = dict(initializer) if isinstance(initializer, Mapping) else {"name": initializer}
@@ -303,7 +303,7 @@ def check_key(key: Any) -> jax.Array:
     """The key, if it is one.
 
     Raises:
-        ValueError: anything but a PRNG key or an array of them, typed or of raw integers.
+      ValueError: anything but a PRNG key or an array of them, typed or of raw integers.
     """
     if hasattr(key, "dtype") and hasattr(key, "shape"):
         if is_key(key):

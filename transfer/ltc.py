@@ -2,7 +2,7 @@
 
 The nearest neighbours of a latent state among stored ones vote for its task; if even the nearest is
 farther than a threshold ξ, the task is novel (equation 22). Distances are Manhattan distances
-(equation 21). Everything is a pure function of arrays, for ``jit`` and ``vmap``.
+(equation 21). Everything is a pure function of arrays, for `jit` and `vmap`.
 
 Axis letters: S samples, M latent feature size, K neighbours.
 """
@@ -32,9 +32,9 @@ class Classifier:
     """A fitted classifier: the samples themselves.
 
     Attributes:
-        latents: float32 [S, M].
-        labels: int32 [S], the task of each, 0 or more.
-        neighbours: K; static.
+      latents: float32 [S, M].
+      labels: int32 [S], the task of each, 0 or more.
+      neighbours: K; static.
     """
 
     latents: Array
@@ -46,9 +46,9 @@ class Neighbours(NamedTuple):
     """The nearest stored samples of each of S queries, nearest first.
 
     Attributes:
-        labels: int32 [S, K], their tasks.
-        distances: float32 [S, K], their Manhattan distances.
-        indices: int32 [S, K], their places among the stored samples.
+      labels: int32 [S, K], their tasks.
+      distances: float32 [S, K], their Manhattan distances.
+      indices: int32 [S, K], their places among the stored samples.
     """
 
     labels: Array
@@ -60,13 +60,13 @@ class Classification(NamedTuple):
     """What each of S queries was taken for.
 
     Attributes:
-        labels: int32 [S], the task, or ``NOVEL`` (-1).
-        votes: int32 [S], the task that the neighbours vote for, whatever the distance; ``NOVEL``
-            for a latent that is not finite, which has no neighbours.
-        distances: float32 [S], the Manhattan distance to the nearest sample; infinite for a latent
-            that is not finite.
-        finite: bool [S], whether every number of the latent is finite. One that is not, as a
-            diverged model gives it, is novel.
+      labels: int32 [S], the task, or `NOVEL` (-1).
+      votes: int32 [S], the task that the neighbours vote for, whatever the distance; `NOVEL`
+        for a latent that is not finite, which has no neighbours.
+      distances: float32 [S], the Manhattan distance to the nearest sample; infinite for a latent
+        that is not finite.
+      finite: bool [S], whether every number of the latent is finite. One that is not, as a
+        diverged model gives it, is novel.
     """
 
     labels: Array
@@ -79,11 +79,11 @@ class Accuracy(NamedTuple):
     """Shares of one set of samples, float32 [] (§4.3.3).
 
     Attributes:
-        correct: classified correctly: as novel where the task is novel; else as not novel and as
-            the right task, both.
-        not_novel: within the threshold of a known sample.
-        right_task: voted for the right task, whatever the distance; 0 for a novel task.
-        not_finite: latents that are not finite, which are taken for novel.
+      correct: classified correctly: as novel where the task is novel; else as not novel and as
+        the right task, both.
+      not_novel: within the threshold of a known sample.
+      right_task: voted for the right task, whatever the distance; 0 for a novel task.
+      not_finite: latents that are not finite, which are taken for novel.
     """
 
     correct: Array
@@ -96,13 +96,13 @@ def fit(latents: Any, labels: Any, *, neighbours: int = NEIGHBOURS) -> Classifie
     """A classifier of the tasks of given samples.
 
     Args:
-        latents: float [S, M].
-        labels: int [S], tasks numbered from 0.
-        neighbours: K, the number of votes.
+      latents: float [S, M].
+      labels: int [S], tasks numbered from 0.
+      neighbours: K, the number of votes.
 
     Raises:
-        ValueError: shapes that do not fit, fewer samples than neighbours, a negative label, or a
-            latent that is not finite (values are checked outside ``jit`` only).
+      ValueError: shapes that do not fit, fewer samples than neighbours, a negative label, or a
+        latent that is not finite (values are checked outside `jit` only).
 
     >>> model = fit([[0.0], [1.0], [9.0]], [0, 0, 1], neighbours=1)
     >>> result = classify(model, jnp.array([[0.4], [8.0], [30.0]]), threshold=2.0)
@@ -133,11 +133,11 @@ def nearest(model: Classifier, latents: Array) -> Neighbours:
     Memory is bounded: queries are taken in chunks, and S queries x S samples x M is never held.
 
     Args:
-        model: from :func:`fit`.
-        latents: float [S, M].
+      model: from `fit`.
+      latents: float [S, M].
 
     Raises:
-        ValueError: latents of another M.
+      ValueError: latents of another M.
     """
     latents = jnp.asarray(latents, jnp.float32)
     if latents.ndim != 2 or latents.shape[1] != model.latents.shape[1]:
@@ -159,7 +159,7 @@ def _closest(distances: Array, count: int) -> tuple[Array, Array]:
 
 
 def _in_chunks(function, queries: Any, numbers_each: int) -> Any:
-    """``function`` of every query, as many at once as the memory for differences allows."""
+    """`function` of every query, as many at once as the memory for differences allows."""
     return jax.lax.map(function, queries, batch_size=max(1, _CHUNK // numbers_each))
 
 
@@ -167,10 +167,10 @@ def vote(labels: Array) -> Array:
     """The most frequent label, the smallest of those that are equally frequent.
 
     Args:
-        labels: int [..., K].
+      labels: int [..., K].
 
     Returns:
-        int [...].
+      int [...].
 
     >>> vote(jnp.array([[3, 1, 3, 1, 2], [2, 2, 0, 0, 0]]))
     Array([1, 0], dtype=int32)
@@ -181,16 +181,16 @@ def vote(labels: Array) -> Array:
 
 
 def classify(model: Classifier, latents: Array, threshold: Any) -> Classification:
-    """The task of each latent state, or ``NOVEL`` (equation 22).
+    """The task of each latent state, or `NOVEL` (equation 22).
 
     Args:
-        model: from :func:`fit`.
-        latents: float [S, M]. One that holds NaN or infinity is novel.
-        threshold: ξ, a scalar: the task is novel if the nearest sample is farther.
+      model: from `fit`.
+      latents: float [S, M]. One that holds NaN or infinity is novel.
+      threshold: ξ, a scalar: the task is novel if the nearest sample is farther.
 
     Raises:
-        ValueError: latents of another M, or a threshold that is not a scalar, or is NaN (where it
-            is concrete; a traced NaN makes every task novel).
+      ValueError: latents of another M, or a threshold that is not a scalar, or is NaN (where it
+        is concrete; a traced NaN makes every task novel).
     """
     if not isinstance(threshold, jax.core.Tracer) and np.isnan(threshold).any():
         raise ValueError(f"Expected a threshold that is a number, got {threshold}.")
@@ -216,8 +216,8 @@ def accuracy(result: Classification, task: Any) -> Accuracy:
     """The accuracy of a set of samples of one task (§4.3.3).
 
     Args:
-        result: from :func:`classify`, of samples of one task.
-        task: int scalar, the true task, or ``NOVEL``; or [S], where samples are of several.
+      result: from `classify`, of samples of one task.
+      task: int scalar, the true task, or `NOVEL`; or [S], where samples are of several.
 
     >>> found = [0, NOVEL, 1], [0, 0, 1], [3.0, 90.0, 5.0], [True, True, True]
     >>> result = Classification(*map(jnp.array, found))
@@ -236,22 +236,22 @@ def suggest_threshold(model: Classifier, *, quantile: float = 0.95, groups: Any 
     """A threshold ξ from the fitted samples' own distances (beyond the thesis: one for any scale).
 
     The distance from each sample to the nearest other one is what a known task looks like. ξ is
-    the smallest value that holds at least the share ``quantile`` of these, with the small-sample
+    the smallest value that holds at least the share `quantile` of these, with the small-sample
     correction of conformal prediction: a fresh sample drawn like the fitted ones is then taken for
-    novel with probability at most 1 - ``quantile``, nearly.
+    novel with probability at most 1 - `quantile`, nearly.
 
     Args:
-        model: from :func:`fit`.
-        quantile: share of known samples that should be within ξ, in (0, 1).
-        groups: int [S], such as the episode each sample comes from; neighbours in the same group
-            do not count. Samples of one episode are closer than those of different ones, and a
-            fresh sample is of a fresh episode. By default each sample is its own group.
+      model: from `fit`.
+      quantile: share of known samples that should be within ξ, in (0, 1).
+      groups: int [S], such as the episode each sample comes from; neighbours in the same group
+        do not count. Samples of one episode are closer than those of different ones, and a
+        fresh sample is of a fresh episode. By default each sample is its own group.
 
     Returns:
-        float32 [], infinite where no sample has a neighbour in another group.
+      float32 [], infinite where no sample has a neighbour in another group.
 
     Raises:
-        ValueError: a quantile outside (0, 1), or groups of another shape.
+      ValueError: a quantile outside (0, 1), or groups of another shape.
 
     >>> model = fit([[0.0], [1.0], [3.0], [7.0]], [0, 0, 0, 0], neighbours=1)
     >>> suggest_threshold(model, quantile=0.5)

@@ -1,8 +1,8 @@
 """Plans of merges as mergekit writes them in YAML (https://github.com/arcee-ai/mergekit).
 
-Read are the methods that both have: ``linear``, ``slerp``, ``task_arithmetic``, ``ties``,
-``dare_linear``, ``dare_ties``, ``breadcrumbs``, ``breadcrumbs_ties``, ``model_stock`` and
-``karcher``; their parameters as numbers, as gradients over layers ([0, 0.5, 1]), and by filter.
+Read are the methods that both have: `linear`, `slerp`, `task_arithmetic`, `ties`,
+`dare_linear`, `dare_ties`, `breadcrumbs`, `breadcrumbs_ties`, `model_stock` and
+`karcher`; their parameters as numbers, as gradients over layers ([0, 0.5, 1]), and by filter.
 What a configuration says beyond that is an error, so that nothing is left out in silence.
 """
 
@@ -51,22 +51,22 @@ _IGNORED_PARAMETERS = ("int8_mask", "filter_wise")
 def read_mergekit(path: str | os.PathLike, *, layers: str = "layers") -> Plan:
     """The plan that a mergekit configuration describes.
 
-    The plan's target is the base model (for ``linear`` and ``karcher`` any tree of its shape), and
+    The plan's target is the base model (for `linear` and `karcher` any tree of its shape), and
     its sources are called by the models' names in the file:
-    ``apply(plan, base, {"org/model-a": a, "org/model-b": b})``. ``dare`` asks for a key.
+    `apply(plan, base, {"org/model-a": a, "org/model-b": b})`. `dare` asks for a key.
 
     As in mergekit a gradient is spread over the layers, which here are what stands behind
-    ``layers`` in a path; leaves outside of them get its first value if their path holds "embed",
-    else its last. A filter selects the leaves whose path holds it, a dot in it being a ``/``.
+    `layers` in a path; leaves outside of them get its first value if their path holds "embed",
+    else its last. A filter selects the leaves whose path holds it, a dot in it being a `/`.
     Unlike mergekit, a filter that selects nothing is an error, and DARE rescales as its paper does,
     by 1 / density.
 
     Args:
-        path: a ``.yaml``, ``.yml`` or ``.json`` file.
-        layers: the part of a path that the number of a layer follows.
+      path: a `.yaml`, `.yml` or `.json` file.
+      layers: the part of a path that the number of a layer follows.
 
     Raises:
-        ValueError: as :func:`transfer.read_plan`; or a method, parameter or entry that is not read.
+      ValueError: as `transfer.read_plan`; or a method, parameter or entry that is not read.
     """
     data = read_data(path)
     try:
@@ -76,7 +76,7 @@ def read_mergekit(path: str | os.PathLike, *, layers: str = "layers") -> Plan:
 
 
 def from_mergekit(data: Any, *, layers: str = "layers") -> Plan:
-    """The plan of a configuration that is loaded already; see :func:`read_mergekit`.
+    """The plan of a configuration that is loaded already; see `read_mergekit`.
 
     >>> plan = from_mergekit({
     ...     "merge_method": "slerp", "base_model": "a", "models": [{"model": "a"}, {"model": "b"}],
@@ -87,7 +87,7 @@ def from_mergekit(data: Any, *, layers: str = "layers") -> Plan:
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"expected a mapping, got {data!r}")
-    method = data.get("merge_method")
+    method: Any = data.get("merge_method")
     if method not in _METHODS:
         raise ValueError(f"the method {method!r} is not read; those are {', '.join(_METHODS)}")
     known = ("merge_method", "base_model", "models", "slices", "parameters", *_IGNORED)
@@ -107,24 +107,24 @@ def from_mergekit(data: Any, *, layers: str = "layers") -> Plan:
     source = tuple(f"{name}:" for name in models)
     groups = _groups(operation, shared, models)
     gradient = any(_is_gradient(value) for group in groups for value in _all(group[1]))
-    rules, earlier = [], []
+    rules: list[Rule] = []
+    earlier: list[str] = []
     for filter_, values in groups:
         holds = [] if filter_ is None else [f"*{part}*" for part in filter_.split(".")]
         middle = "/".join(["**", *holds, "**"]) if holds else "**"
         without = tuple(f"!{pattern}" for pattern in earlier)
         inside = f"**/{layers}/{{layer}}/{middle}"
-        regions = [(("**" if not holds else middle), None, False)]
+        regions: list[tuple[tuple[str, ...], Any, bool]] = [((middle,), None, False)]
         if gradient:
             outside = f"!**/{layers}/*/**"
             first = "**/*embed*/**"
             regions = [
                 ((inside,), "layer", False),
                 ((middle, outside, f"!{first}"), 1.0, True),
-                ((first, outside), 0.0, True) if not holds else None,
             ]
-        for region in filter(None, regions):
-            patterns, place, optional = region
-            patterns = (patterns,) if isinstance(patterns, str) else patterns
+            if not holds:
+                regions.append(((first, outside), 0.0, True))
+        for patterns, place, optional in regions:
             rules.append(
                 Rule(
                     (*patterns, *without),

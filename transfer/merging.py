@@ -2,12 +2,12 @@
 
 The target is that start, the *base* θ₀; each source θ_n is a model trained from it, and
 τ_n = θ_n - θ₀ is its task vector (Ilharco et al., 2023). Every operation is a pure function
-``operation(target, sources, *, ..., where=None)`` with the rules of :mod:`transfer.surgery`, and
-works leaf by leaf, as mergekit does. :func:`slerp` has one source. Those that trim and add task
-vectors are in :mod:`transfer.task_vectors`.
+`operation(target, sources, *, ..., where=None)` with the rules of `transfer.surgery`, and
+works leaf by leaf, as mergekit does. `slerp` has one source. Those that trim and add task
+vectors are in `transfer.task_vectors`.
 
 Numbers are scalars, or one for each source [N], or trees of these, one for each leaf (see
-:func:`transfer.fraction`); all may be traced, so that many merges are one mapped program. Of a
+`transfer.fraction`); all may be traced, so that many merges are one mapped program. Of a
 population each member is merged by itself, with numbers [P] and [P, N] where they differ.
 
 Axis letters: P population member, N source; n numbers in a leaf.
@@ -39,7 +39,7 @@ from transfer.values import numbers
 
 
 class Number(NamedTuple):
-    """A parameter of a merge: what it is, and its range; ``each`` means one for every source."""
+    """A parameter of a merge: what it is, and its range; `each` means one for every source."""
 
     value: Any
     each: bool = False
@@ -58,9 +58,9 @@ def merge_leaves(
     reads_target: bool = True,
     **given: Number,
 ) -> PyTree:
-    """``formula(base, models, *numbers)`` of each leaf, in float32 at least.
+    """`formula(base, models, *numbers)` of each leaf, in float32 at least.
 
-    ``models`` is [N, ...]; with a key, uniform numbers of its shape come before the numbers.
+    `models` is [N, ...]; with a key, uniform numbers of its shape come before the numbers.
     """
     flat = [flatten(source) for source in sources]
     if not flat:
@@ -83,7 +83,8 @@ def merge_leaves(
         # [P, N, ...] for a population, so that members are mapped and sources follow.
         axis = 1 if population else 0
         models = jnp.stack([wide(path, other) for other in others], axis=axis)
-        arguments, axes = [base, models], [0, 0]
+        arguments = [base, models]
+        axes: list[int | None] = [0, 0]
         if key is not None:
             arguments.append(
                 draw(jax.random.uniform, path, key, models.shape, jnp.float32, population)
@@ -101,7 +102,7 @@ def merge_leaves(
 
 
 def _shaped(path, name, number: Number, value, base, count: int, members: int):
-    """A number as an array [] or [N], with P in front where ``members``, and whether it has P."""
+    """A number as an array [] or [N], with P in front where `members`, and whether it has P."""
     shape = np.shape(value)
     per_source = (count,) if number.each else ()
     size = base.shape[:1] if members else ()
@@ -130,15 +131,15 @@ def average(
     """Σ w_n θ_n / Σ w_n, the weighted mean ("Model soups", Wortsman et al., 2022, section 2).
 
     Args:
-        target: the tree to change; its values are not read.
-        sources: N models θ_n.
-        weights: w_n, 0 or more, a scalar or [N].
-        normalise: whether the sum is divided by Σ w_n.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to change.
+      target: the tree to change; its values are not read.
+      sources: N models θ_n.
+      weights: w_n, 0 or more, a scalar or [N].
+      normalise: whether the sum is divided by Σ w_n.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to change.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`; not one weight for each source, or all of them 0.
+      ValueError: as `transfer.fraction`; not one weight for each source, or all of them 0.
 
     >>> average({"w": jnp.zeros(1)}, [{"w": jnp.ones(1)}, {"w": 4 * jnp.ones(1)}], weights=[2, 1])
     {'w': Array([2.], dtype=float32)}
@@ -192,7 +193,7 @@ def model_stock(
     them. A mean cosine below 0 counts as 0.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`, or fewer than two sources.
+      ValueError: as `transfer.fraction`, or fewer than two sources.
 
     >>> base = {"w": jnp.zeros(2)}
     >>> model_stock(base, [{"w": jnp.array([1.0, 0.0])}, {"w": jnp.array([0.0, 1.0])}])
@@ -241,14 +242,14 @@ def slerp(
     one of them is zero.
 
     Args:
-        target: the tree at 0.
-        source: the tree at 1.
-        weight: t in [0, 1], a scalar.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to change.
+      target: the tree at 0.
+      source: the tree at 1.
+      weight: t in [0, 1], a scalar.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to change.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`.
+      ValueError: as `transfer.fraction`.
 
     >>> new = slerp({"w": jnp.array([1.0, 0.0])}, {"w": jnp.array([0.0, 1.0])}, weight=0.5)
     >>> new["w"].round(4)
@@ -277,7 +278,7 @@ def karcher_mean(
     population: bool = False,
     where: Where = None,
 ) -> PyTree:
-    """The mean of the models on the sphere: many models' :func:`slerp` (Karcher, 1977).
+    """The mean of the models on the sphere: many models' `slerp` (Karcher, 1977).
 
     Leaf by leaf the sources are brought to length 1; u ← exp_u(Σ w_n log_u(θ_n / |θ_n|)) is
     repeated from their straight mean, where log_u is the tangent at u towards a point, as long as
@@ -285,15 +286,15 @@ def karcher_mean(
     target gives shape and dtype only.
 
     Args:
-        target: the tree to change.
-        sources: N models.
-        weights: w_n, 0 or more, a scalar or [N], divided by their sum.
-        iterations: how often; 20 are enough for models trained from one start.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to merge.
+      target: the tree to change.
+      sources: N models.
+      weights: w_n, 0 or more, a scalar or [N], divided by their sum.
+      iterations: how often; 20 are enough for models trained from one start.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to merge.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`, or not one weight for each source.
+      ValueError: as `transfer.fraction`, or not one weight for each source.
 
     >>> ends = [{"w": jnp.array([2.0, 0.0])}, {"w": jnp.array([0.0, 4.0])}]
     >>> karcher_mean({"w": jnp.zeros(2)}, ends)["w"].round(4)

@@ -7,12 +7,12 @@ usual input, what each of them predicts from that input, and learns which to tru
     inputs = meta_inputs(apply_head, stored, features)        # [..., M + 4 * outputs]
     reward = apply_meta(params, inputs)
 
-A head is any function ``apply_head(params, inputs) -> predictions``, of any library and for any
+A head is any function `apply_head(params, inputs) -> predictions`, of any library and for any
 purpose: reward, value, or dynamics, whose inputs may be a tuple of state and action. The gradient
 passes through the frozen heads into their inputs, never into their parameters.
 
 Axis letters: N source task, M latent feature size; O outputs of a head. For a population map these
-functions over the leading axis P of the stored models with ``jax.vmap``.
+functions over the leading axis P of the stored models with `jax.vmap`.
 """
 
 import dataclasses
@@ -36,9 +36,9 @@ class StoredHeads:
     """Frozen heads of N source tasks: arrays only, to live in an agent's state and checkpoints.
 
     Attributes:
-        params: parameters of one head with leaves [N, ...]; those of the first head again where
-            ``present`` is False.
-        present: bool [N], False for places that only pad N to a common size.
+      params: parameters of one head with leaves [N, ...]; those of the first head again where
+        `present` is False.
+      present: bool [N], False for places that only pad N to a common size.
     """
 
     params: PyTree
@@ -49,12 +49,12 @@ def store(heads: Sequence[PyTree], *, size: int | None = None) -> StoredHeads:
     """Store the parameters of heads of one architecture.
 
     Args:
-        heads: their parameters, one tree for each source task.
-        size: N to pad to, so that targets with different numbers of sources have one shape and
-            train as one population; by default the number of heads.
+      heads: their parameters, one tree for each source task.
+      size: N to pad to, so that targets with different numbers of sources have one shape and
+        train as one population; by default the number of heads.
 
     Raises:
-        ValueError: no heads, more than ``size``, or heads that differ in structure or shape.
+      ValueError: no heads, more than `size`, or heads that differ in structure or shape.
 
     >>> stored = store([{"w": jnp.ones(2)}, {"w": 2 * jnp.ones(2)}], size=3)
     >>> stored.params["w"], stored.present
@@ -75,12 +75,12 @@ def predictions(apply_head: ApplyHead, stored: StoredHeads, inputs: Any) -> Arra
     """What each stored head predicts.
 
     Args:
-        apply_head: ``apply_head(params, inputs) -> float [..., O]``.
-        stored: N heads.
-        inputs: what a head reads, the same for all: features [..., M], or any pytree.
+      apply_head: `apply_head(params, inputs) -> float [..., O]`.
+      stored: N heads.
+      inputs: what a head reads, the same for all: features [..., M], or any pytree.
 
     Returns:
-        float [..., N, O], zero for the places that are not present.
+      float [..., N, O], zero for the places that are not present.
 
     >>> stored = store([{"w": jnp.ones((2, 1))}, {"w": 2 * jnp.ones((2, 1))}], size=3)
     >>> predictions(lambda params, x: x @ params["w"], stored, jnp.array([1.0, 2.0]))
@@ -99,13 +99,13 @@ def meta_inputs(
     """The input of a meta-model: its usual input and the predictions of the stored heads.
 
     Args:
-        apply_head: as in :func:`predictions`.
-        stored: N heads.
-        inputs: what a stored head reads.
-        context: what the meta-model reads beside, float [..., M]; by default ``inputs``.
+      apply_head: as in `predictions`.
+      stored: N heads.
+      inputs: what a stored head reads.
+      context: what the meta-model reads beside, float [..., M]; by default `inputs`.
 
     Returns:
-        float [..., M + N * O]: the context first, then head by head.
+      float [..., M + N * O]: the context first, then head by head.
 
     >>> stored = store([{"w": jnp.ones((2, 1))}], size=2)
     >>> meta_inputs(lambda params, x: x @ params["w"], stored, jnp.array([1.0, 2.0]))
@@ -121,13 +121,13 @@ def switch(labels: Array, stored_predictions: Array, meta_prediction: Array) -> 
     """The stored head of a task that is known, the meta-model for one that is novel (§3.3.3).
 
     Args:
-        labels: int [...], the position of the task's head among the stored, or ``NOVEL``, as
-            :func:`transfer.ltc.classify` says.
-        stored_predictions: float [..., N, O] from :func:`predictions`.
-        meta_prediction: float [..., O].
+      labels: int [...], the position of the task's head among the stored, or `NOVEL`, as
+        `transfer.ltc.classify` says.
+      stored_predictions: float [..., N, O] from `predictions`.
+      meta_prediction: float [..., O].
 
     Returns:
-        float [..., O].
+      float [..., O].
 
     >>> switch(jnp.array([1, NOVEL]), jnp.array([[[1.0], [2.0]]] * 2), jnp.array([[9.0], [9.0]]))
     Array([[2.],

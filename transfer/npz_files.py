@@ -1,11 +1,12 @@
-"""Arrays in ``.npz`` files: zip archives of NumPy's own format, compressed or not."""
+"""Arrays in `.npz` files: zip archives of NumPy's own format, compressed or not."""
 
+import io
 import json
 import math
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +46,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class NpzFile(ArrayFile):
-    """An ``.npz`` file. Zip's own checksum of an array is compared whenever it is read."""
+    """An `.npz` file. Zip's own checksum of an array is compared whenever it is read."""
 
     def __init__(self, path: Path, max_bytes: int | None):
         super().__init__(path, max_bytes)
@@ -122,10 +123,12 @@ class NpzFile(ArrayFile):
         return {name: self._read_one(name) for name in names}
 
     def _read_one(self, name: str) -> np.ndarray:
-        with damage(self._path, name), self._archive.open(self._entries[name]) as file:
+        with damage(self._path, name), self._archive.open(self._entries[name]) as opened:
+            # The hints of zipfile promise less than it gives.
+            file = cast(io.BufferedIOBase, opened)
             shape, columns_first, dtype = self._header(name, file)
             data = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)
-            view, filled = memoryview(data), 0
+            view, filled = data.data, 0
             while filled < len(data) and (count := file.readinto(view[filled:])):
                 filled += count
             # To read on at the end is what makes zipfile compare the checksum.

@@ -1,7 +1,7 @@
 """The state of an optimiser moved with the parameters, by the same plan.
 
 Optax keeps what it remembers of a parameter (Adam's moments, a momentum) in trees like that of the
-parameters, somewhere in its state: the *slots* ``0/mu/...`` and ``0/nu/...``. A plan for parameters
+parameters, somewhere in its state: the *slots* `0/mu/...` and `0/nu/...`. A plan for parameters
 says what becomes of each of these too.
 """
 
@@ -39,35 +39,35 @@ def apply_to_optimizer(
 ) -> tuple[PyTree, dict[str, str]]:
     """The state of an optimiser after the plan that its parameters were transferred by.
 
-    A leaf of a slot follows its parameter. Where the plan moves the source's numbers (``copy``,
-    ``take``, ``splice``, ``pad``, ``crop``, renamed and in another layout too) the memory is moved
+    A leaf of a slot follows its parameter. Where the plan moves the source's numbers (`copy`,
+    `take`, `splice`, `pad`, `crop`, renamed and in another layout too) the memory is moved
     in the same way, and what the source does not fill is fresh. Where the plan keeps, draws, mixes
     or merges, the parameter is a new one, and its memory stays fresh.
 
     Args:
-        plan: the plan of the parameters; of one source.
-        target: the parameters that the plan was applied to; only paths and shapes are read.
-        target_state: ``optimizer.init(...)`` of the new parameters.
-        source_state: the source's optimiser state, of the same optimiser.
-        moments: ``"copy"`` the memory; ``"scale"`` it, gradients being expected ``scale`` times as
-            large: first moments and momenta times s, second moments (slots called ``nu``) times s²;
-            or ``"reset"`` everything, which gives ``target_state``.
-        scale: s, a scalar of 0 or more, for ``"scale"``.
-        counts: whether numbers of steps (Adam's bias correction, schedules) are the source's or the
-            target's. By default the source's where the memory of every parameter was moved, the
-            target's where none was; where only some was, one number cannot be right for all, and it
-            must be said: with the source's, fresh moments are not corrected (their first steps are
-            up to 3 times too long with Adam's usual decays); with the target's, moved ones are
-            corrected twice (a third of the length).
-        operations: as for :func:`transfer.apply`.
+      plan: the plan of the parameters; of one source.
+      target: the parameters that the plan was applied to; only paths and shapes are read.
+      target_state: `optimizer.init(...)` of the new parameters.
+      source_state: the source's optimiser state, of the same optimiser.
+      moments: `"copy"` the memory; `"scale"` it, gradients being expected `scale` times as
+        large: first moments and momenta times s, second moments (slots called `nu`) times s²;
+        or `"reset"` everything, which gives `target_state`.
+      scale: s, a scalar of 0 or more, for `"scale"`.
+      counts: whether numbers of steps (Adam's bias correction, schedules) are the source's or the
+        target's. By default the source's where the memory of every parameter was moved, the
+        target's where none was; where only some was, one number cannot be right for all, and it
+        must be said: with the source's, fresh moments are not corrected (their first steps are
+        up to 3 times too long with Adam's usual decays); with the target's, moved ones are
+        corrected twice (a third of the length).
+      operations: as for `transfer.apply`.
 
     Returns:
-        The state, and what happened to each of its leaves: ``{path: "copied" | "scaled" | "reset" |
-        "source's count" | "target's count"}``.
+      The state, and what happened to each of its leaves: `{path: "copied" | "scaled" | "reset" |
+      "source's count" | "target's count"}`.
 
     Raises:
-        ValueError: a plan of several sources, a leaf that the source's state lacks, ``counts`` not
-            given where it must be, or as the operations.
+      ValueError: a plan of several sources, a leaf that the source's state lacks, `counts` not
+        given where it must be, or as the operations.
 
     >>> params, adam = {"body": jnp.ones(2), "head": jnp.ones(2)}, optax.adam(0.1)
     >>> _, old = adam.update(params, adam.init(params), params)

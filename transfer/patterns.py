@@ -3,15 +3,15 @@ r"""Patterns over paths: globs that remember what they stood for.
 A *pattern* is a glob over the parts of a '/'-joined path:
 
 =======================  ========================================================
-``reward/out/*``         ``*`` and ``?`` and ``[ab]`` match inside one part
-``dynamics/**``          ``**`` stands for any number of parts, none included
-``layers/{i}/kernel``    ``{i}`` matches as ``*`` does, one character at least, and
-                         is remembered by its name; ``{i:**}`` matches as ``**``
-``!dynamics/gru/*``      ``!`` takes leaves away from what came before it
-``w\[0]``, ``\!w``     a backslash makes the next character an ordinary one
+`reward/out/*`         `*` and `?` and `[ab]` match inside one part
+`dynamics/**`          `**` stands for any number of parts, none included
+`layers/{i}/kernel`    `{i}` matches as `*` does, one character at least, and
+                         is remembered by its name; `{i:**}` matches as `**`
+`!dynamics/gru/*`      `!` takes leaves away from what came before it
+`w\[0]`, `\!w`     a backslash makes the next character an ordinary one
 =======================  ========================================================
 
-:func:`escape` writes the pattern of one path, whatever characters it holds.
+`escape` writes the pattern of one path, whatever characters it holds.
 """
 
 import difflib
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 
 def match(pattern: str, path: str) -> bool:
-    """Whether a pattern (without a leading ``!``) matches a whole path.
+    """Whether a pattern (without a leading `!`) matches a whole path.
 
     >>> match("dynamics/**/kernel", "dynamics/prior/out/kernel"), match("*/out", "reward/out/bias")
     (True, False)
@@ -31,13 +31,13 @@ def match(pattern: str, path: str) -> bool:
 
 
 def captures(pattern: str, path: str) -> dict[str, str] | None:
-    """What the named parts of a pattern stand for in a path; ``None`` if it does not match.
+    """What the named parts of a pattern stand for in a path; `None` if it does not match.
 
     A name that comes twice stands for the same text twice. Of several ways to match, each
     wildcard takes as few parts as it can, the first of them first.
 
     Raises:
-        ValueError: a pattern that cannot be read, such as ``{1st}``.
+      ValueError: a pattern that cannot be read, such as `{1st}`.
 
     >>> captures("layers/{i}/{rest:**}", "layers/3/attention/kernel")
     {'i': '3', 'rest': 'attention/kernel'}
@@ -48,36 +48,32 @@ def captures(pattern: str, path: str) -> dict[str, str] | None:
     at = position = 0
     # Where to go on after a mismatch: the last "**" takes one part more. One such place is enough,
     # as for the "*" of a file name, so no pattern takes more than parts x parts comparisons.
-    retry: tuple[int, int, int, dict[str, str]] | None = None
+    retry: tuple[int, str | None, int, int, dict[str, str]] | None = None
     while True:
-        if at < len(wanted) and isinstance(wanted[at], _Several):
-            retry = (at, position, position, dict(found))
-            found = _with(found, wanted[at].name, "")
-        elif at < len(wanted) and position < len(parts):
-            hit = wanted[at].fullmatch(parts[position])
+        part = wanted[at] if at < len(wanted) else None
+        if isinstance(part, _Several):
+            retry = (at, part.name, position, position, dict(found))
+            found, at = _with(found, part.name, ""), at + 1
+            continue
+        if part is None and position == len(parts):
+            return found
+        if part is not None and position < len(parts):
+            hit = part.fullmatch(parts[position])
             named = found if hit is None else _merged(found, hit.groupdict())
             if hit is not None and named is not None:
                 found, at, position = named, at + 1, position + 1
                 continue
-            found = None
-        else:
-            found = found if at == len(wanted) and position == len(parts) else None
-            if found is not None:
-                return found
-        if found is not None:
-            at += 1
-            continue
-        if retry is None or retry[2] >= len(parts):
+        if retry is None or retry[3] >= len(parts):
             return None
-        at, start, end, before = retry
-        retry = (at, start, end + 1, before)
+        at, name, start, end, before = retry
+        retry = (at, name, start, end + 1, before)
         position = end + 1
-        found = _with(before, wanted[at].name, "/".join(parts[start:position]))
+        found = _with(before, name, "/".join(parts[start:position]))
         at += 1
 
 
 class _Several(NamedTuple):
-    """``**``, or ``{name:**}``."""
+    """`**`, or `{name:**}`."""
 
     name: str | None
 
@@ -87,7 +83,7 @@ def _with(found: dict[str, str], name: str | None, value: str) -> dict[str, str]
 
 
 def _merged(found: dict[str, str], new: dict[str, str]) -> dict[str, str] | None:
-    """Both together, or ``None`` where they differ."""
+    """Both together, or `None` where they differ."""
     if any(found.get(name, value) != value for name, value in new.items()):
         return None
     return {**found, **new}
@@ -106,12 +102,12 @@ def _part(part: str) -> "re.Pattern[str] | _Several":
         return _Several(_checked_name(part, named[1].removesuffix(":**")))
     # Text and wildcards in turn. Each wildcard with the text behind it is an atomic group: the
     # first place where the text fits is as good as any later one.
-    pieces: list[tuple[str | None, str]] = [(None, "")]
+    pieces: list[tuple[str, str]] = [("", "")]
     seen: set[str] = set()
     index = 0
     while index < len(part):
         character, rest = part[index], part[index:]
-        wildcard, text, length = None, re.escape(character), 1
+        wildcard, text, length = "", re.escape(character), 1
         if character == "\\" and len(rest) > 1:
             text, length = re.escape(rest[1]), 2
         elif character == "*":
@@ -124,12 +120,12 @@ def _part(part: str) -> "re.Pattern[str] | _Several":
             text, length = f"[{inside}]", end + 1
         elif character == "{" and (named := _NAMED.match(rest)):
             name, length = _checked_name(part, named[1]), named.end()
-            wildcard, text = (f"(?P<{name}>.+)", "") if name not in seen else (None, f"(?P={name})")
+            wildcard, text = (f"(?P<{name}>.+)", "") if name not in seen else ("", f"(?P={name})")
             seen.add(name)
-        if wildcard is None:
-            pieces[-1] = (pieces[-1][0], pieces[-1][1] + text)
-        else:
+        if wildcard:
             pieces.append((wildcard, ""))
+        else:
+            pieces[-1] = (pieces[-1][0], pieces[-1][1] + text)
         index += length
     expression = pieces[0][1]
     for number, (wildcard, text) in enumerate(pieces[1:], start=2):
@@ -145,7 +141,7 @@ def _part(part: str) -> "re.Pattern[str] | _Several":
 
 
 def _end_of_class(text: str) -> int | None:
-    """The place of the bracket that closes the class which ``text`` begins with."""
+    """The place of the bracket that closes the class which `text` begins with."""
     end = text.find("]", 3 if text.startswith("[!") else 2)
     return end if end > 0 else None
 
@@ -170,7 +166,7 @@ def escape(path: str) -> str:
 
 
 def suggest(pattern: str, names: Iterable[str]) -> str:
-    """Near misses for an error message: leaves, and branches written as ``branch/**``."""
+    """Near misses for an error message: leaves, and branches written as `branch/**`."""
     names = list(names)
     branches = sorted(
         {
@@ -199,7 +195,7 @@ def pattern_list(patterns: Sequence[Any]) -> tuple[str, ...]:
     """Patterns given one by one or as lists, as one tuple.
 
     Raises:
-        ValueError: what is given is no string, or nothing is given.
+      ValueError: what is given is no string, or nothing is given.
     """
     found: list[str] = []
     for pattern in patterns:
@@ -220,11 +216,11 @@ def is_list(value: Any) -> bool:
 
 
 def match_paths(names: Sequence[str], *patterns: Any, optional: bool = False) -> frozenset[str]:
-    """The names among ``names`` that the patterns select, taken in order.
+    """The names among `names` that the patterns select, taken in order.
 
     Raises:
-        ValueError: a pattern matches no name at all, unless ``optional``; the message lists near
-            misses.
+      ValueError: a pattern matches no name at all, unless `optional`; the message lists near
+        misses.
     """
     patterns = pattern_list(patterns)
     chosen: set[str] = set(names) if patterns[0].startswith("!") else set()

@@ -1,15 +1,15 @@
 """Plans: which operation happens to which leaf, as data.
 
-A :class:`Plan` is a list of rules (patterns -> operation). Every leaf of the target must be claimed
+A `Plan` is a list of rules (patterns -> operation). Every leaf of the target must be claimed
 by exactly one rule, or by the plan's explicit default: what a plan forgets is an error, and so is
 what it says twice. Plans are values: they print, compare, hash, cannot be changed, and go to YAML
-or JSON and back (see :mod:`transfer.plan_files`). :func:`transfer.apply` carries one out.
+or JSON and back (see `transfer.plan_files`). `transfer.apply` carries one out.
 """
 
 import dataclasses
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ class Parameters(Mapping[str, Any]):
     """A mapping that cannot be changed, with a hash."""
 
     __slots__ = ("_items",)
+    _items: Mapping[str, Any]
 
     def __init__(self, items: Mapping[str, Any]):
         object.__setattr__(self, "_items", dict(items))
@@ -93,7 +94,7 @@ def _tuples(array: np.ndarray) -> Any:
 
 
 class Reading(NamedTuple):
-    """Where a rule reads: which source (``None``: the only one) and which path (``None``: the
+    """Where a rule reads: which source (`None`: the only one) and which path (`None`: the
     target's own)."""
 
     name: str | None
@@ -116,34 +117,34 @@ class Rule:
     """What happens to the leaves that some patterns select.
 
     Attributes:
-        patterns: glob patterns, taken in order (see :func:`transfer.select`); one may be given as
-            a plain string.
-        operation: the name of an operation, such as ``"copy"``.
-        parameters: its keyword arguments. What is left out is given to :func:`transfer.apply` by
-            name. A number may differ with depth, ``{"values": [0, 0.5, 1], "over": "layer"}``: the
-            values are spread evenly over what ``{layer}`` in the pattern stands for, in between
-            linearly.
-        source: where the rule reads; ``None`` for the same path of the only source.
+      patterns: glob patterns, taken in order (see `transfer.select`); one may be given as
+        a plain string.
+      operation: the name of an operation, such as `"copy"`.
+      parameters: its keyword arguments. What is left out is given to `transfer.apply` by
+        name. A number may differ with depth, `{"values": [0, 0.5, 1], "over": "layer"}`: the
+        values are spread evenly over what `{layer}` in the pattern stands for, in between
+        linearly.
+      source: where the rule reads; `None` for the same path of the only source.
 
-            * ``"teacher"``: the same path of the source of that name, where there are several;
-            * ``"blk/{i}/attn/{rest}"``: another path of the only source, with what ``{i}`` and
-              ``{rest}`` in the pattern stand for. A path of a single part is written ``":weight"``;
-            * ``"teacher:blk/{i}/w"``: both. A name that holds a ``/`` ends with ``:``.
+        * `"teacher"`: the same path of the source of that name, where there are several;
+        * `"blk/{i}/attn/{rest}"`: another path of the only source, with what `{i}` and
+          `{rest}` in the pattern stand for. A path of a single part is written `":weight"`;
+        * `"teacher:blk/{i}/w"`: both. A name that holds a `/` ends with `:`.
 
-            A tuple names one source each for operations on several (``average``); for others it
-            names several leaves, or a path with ``*`` does, that the layout's first step joins.
-        optional: whether the patterns may match nothing (a head that not every agent has).
-        frozen: whether the leaves are meant to stay as they are in training. ``apply`` only says
-            so in its report; :func:`frozen` gives the mask that ``freeze`` acts on.
-        note: a word to the reader of the plan.
-        layout: steps from the arrays that are read to the one the operation takes, see
-            :mod:`transfer.layout`.
+        A tuple names one source each for operations on several (`average`); for others it
+        names several leaves, or a path with `*` does, that the layout's first step joins.
+      optional: whether the patterns may match nothing (a head that not every agent has).
+      frozen: whether the leaves are meant to stay as they are in training. `apply` only says
+        so in its report; `frozen` gives the mask that `freeze` acts on.
+      note: a word to the reader of the plan.
+      layout: steps from the arrays that are read to the one the operation takes, see
+        `transfer.layout`.
 
     Lists and arrays among these become tuples, so that a rule is a value that never changes.
 
     Raises:
-        ValueError: a field of the wrong type, a captured part that no pattern has, or a layout
-            with an unknown step.
+      ValueError: a field of the wrong type, a captured part that no pattern has, or a layout
+        with an unknown step.
     """
 
     patterns: tuple[str, ...]
@@ -155,8 +156,24 @@ class Rule:
     note: str = ""
     layout: tuple[Any, ...] = ()
 
+    if TYPE_CHECKING:
+        # What may be given, where the fields say what there is.
+        def __init__(
+            self,
+            patterns: str | Sequence[str],
+            operation: str,
+            parameters: Mapping[str, Any] = ...,
+            source: str | Sequence[str] | None = None,
+            optional: bool = False,
+            frozen: bool = False,
+            note: str = "",
+            layout: str | Mapping[str, Any] | Sequence[Any] = (),
+        ) -> None: ...
+
     def __post_init__(self):
-        patterns = (self.patterns,) if isinstance(self.patterns, str) else self.patterns
+        patterns: Any = self.patterns
+        if isinstance(patterns, str):
+            patterns = (patterns,)
         if (
             not isinstance(patterns, Sequence)
             or not patterns
@@ -175,11 +192,15 @@ class Rule:
             ("note", str, "text"),
         ):
             _check_type(what, name, getattr(self, name), kind, word)
-        source = tuple(self.source) if isinstance(self.source, list) else self.source
+        source: Any = self.source
+        if isinstance(source, list):
+            source = tuple(source)
         for text in source if isinstance(source, tuple) else (source,):
             if text is not None or source == ():
                 _check_type(what, "source", text, str, "a name, or several")
-        layout = (self.layout,) if isinstance(self.layout, str | Mapping) else self.layout
+        layout: Any = self.layout
+        if isinstance(layout, str | Mapping):
+            layout = (layout,)
         layouts.steps(layout)
         object.__setattr__(self, "patterns", tuple(patterns))
         object.__setattr__(self, "source", source)
@@ -206,7 +227,7 @@ class Rule:
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """What ``source`` says, entry by entry; one empty entry where it says nothing."""
+        """What `source` says, entry by entry; one empty entry where it says nothing."""
         if self.source is None:
             return (Reading(None, None),)
         return tuple(map(_reading, (self.source,) if isinstance(self.source, str) else self.source))
@@ -222,7 +243,7 @@ class Rule:
         return f"{', '.join(self.patterns)} -> {self.operation}"
 
     def describe(self) -> str:
-        """The operation with its parameters, as in ``fraction(omega=0.2)``."""
+        """The operation with its parameters, as in `fraction(omega=0.2)`."""
         arguments = [f"{name}={value}" for name, value in self.parameters.items()]
         if self.source is not None:
             arguments.append(f"source={self.source}")
@@ -232,11 +253,11 @@ class Rule:
 
 
 def is_gradient(value: Any) -> bool:
-    """Whether a parameter is ``{"values": ..., "over": name}``."""
+    """Whether a parameter is `{"values": ..., "over": name}`."""
     return isinstance(value, Mapping) and set(value) == {"values", "over"}
 
 
-def _check_type(what: str, name: str, value: Any, kind: type, word: str) -> None:
+def _check_type(what: str, name: str, value: Any, kind: Any, word: str) -> None:
     if not isinstance(value, kind):
         raise ValueError(
             f"{name} of {what} is {value!r} ({type(value).__name__}); expected {word}."
@@ -248,10 +269,10 @@ class Plan:
     """An ordered list of rules that together claim every leaf once.
 
     Attributes:
-        rules: the rules.
-        default: the operation for leaves that no rule claims (``"keep"``, ``"copy"``); with
-            ``None`` such leaves are an error.
-        name: what the plan is called when printed.
+      rules: the rules.
+      default: the operation for leaves that no rule claims (`"keep"`, `"copy"`); with
+        `None` such leaves are an error.
+      name: what the plan is called when printed.
 
     >>> plan = Plan((Rule("body/**", "copy"), Rule("head/**", "fraction", {"omega": 0.5})))
     >>> print(plan)
@@ -289,8 +310,8 @@ def claims(plan: Plan, target: PyTree) -> dict[str, Rule]:
     """The rule that claims each leaf of a target, by path, in tree order.
 
     Raises:
-        ValueError: a leaf claimed twice or by nobody, or a rule that is not optional and claims
-            nothing.
+      ValueError: a leaf claimed twice or by nobody, or a rule that is not optional and claims
+        nothing.
 
     >>> plan = Plan((Rule("head/**", "keep"),), default="copy")
     >>> found = claims(plan, {"body": {"w": jnp.ones(2)}, "head": {"w": jnp.ones(2)}})
@@ -313,8 +334,9 @@ def claims(plan: Plan, target: PyTree) -> dict[str, Rule]:
             f"No rule claims {len(left)} of {len(names)} leaves: {', '.join(left)}. Add a rule, or "
             "set the plan's default."
         )
-    rest = Rule("**", plan.default) if left else None
-    return {path: claimed.get(path, rest) for path in names}
+    if left and plan.default is not None:
+        claimed |= dict.fromkeys(left, Rule("**", plan.default))
+    return {path: claimed[path] for path in names}
 
 
 def frozen(plan: Plan, tree: PyTree) -> Mask:

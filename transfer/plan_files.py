@@ -1,7 +1,7 @@
 """Plans as data: plain dictionaries, and JSON or YAML files, both ways.
 
 Reading builds strings, numbers, lists and mappings only: a file cannot execute code, and names an
-operation by its name in ``OPERATIONS``.
+operation by its name in `OPERATIONS`.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ def to_dict(plan: Plan) -> dict[str, Any]:
     """A plan as plain lists, dictionaries, strings and numbers.
 
     Raises:
-        ValueError: a parameter that is not data, such as a function or a traced array.
+      ValueError: a parameter that is not data, such as a function or a traced array.
 
     >>> to_dict(Plan((Rule("head/*", "fraction", {"omega": 0.2}),), default="copy"))
     {'rules': [{'patterns': ['head/*'], 'operation': 'fraction', 'parameters': {'omega': 0.2}}], \
@@ -57,10 +57,10 @@ def _plain(name: str, value: Any) -> Any:
 
 
 def from_dict(data: Mapping[str, Any]) -> Plan:
-    """The plan that :func:`to_dict` wrote.
+    """The plan that `to_dict` wrote.
 
     Raises:
-        ValueError: an entry that is not known, is missing, or has the wrong type.
+      ValueError: an entry that is not known, is missing, or has the wrong type.
 
     >>> from_dict({"rules": [{"patterns": ["head/*"], "operation": "keep"}], "default": "copy"})
     Plan(rules=(Rule(patterns=('head/*',), operation='keep', parameters={}, source=None, \
@@ -90,10 +90,10 @@ def _check_entries(data: Any, what: str, *, required: Sequence[str], known: Sequ
 
 
 def write_plan(plan: Plan, path: str | os.PathLike) -> None:
-    """Write a plan to a ``.json``, ``.yaml`` or ``.yml`` file.
+    """Write a plan to a `.json`, `.yaml` or `.yml` file.
 
     Raises:
-        ValueError: another suffix, or as :func:`to_dict`.
+      ValueError: another suffix, or as `to_dict`.
     """
     data = to_dict(plan)
     if _is_json(path):
@@ -104,11 +104,11 @@ def write_plan(plan: Plan, path: str | os.PathLike) -> None:
 
 
 def read_plan(path: str | os.PathLike) -> Plan:
-    """The plan in a ``.json``, ``.yaml`` or ``.yml`` file.
+    """The plan in a `.json`, `.yaml` or `.yml` file.
 
     Raises:
-        ValueError: another suffix, a file that cannot be parsed or has a key twice, or as
-            :func:`from_dict`.
+      ValueError: another suffix, a file that cannot be parsed or has a key twice, or as
+        `from_dict`.
     """
     data = read_data(path)
     try:
@@ -118,10 +118,10 @@ def read_plan(path: str | os.PathLike) -> Plan:
 
 
 def read_data(path: str | os.PathLike) -> Any:
-    """What a ``.json``, ``.yaml`` or ``.yml`` file holds: numbers, text, lists and mappings.
+    """What a `.json`, `.yaml` or `.yml` file holds: numbers, text, lists and mappings.
 
     Raises:
-        ValueError: another suffix, a file that cannot be parsed, or a mapping with a key twice.
+      ValueError: another suffix, a file that cannot be parsed, or a mapping with a key twice.
     """
     if _is_json(path):
         try:
@@ -131,7 +131,7 @@ def read_data(path: str | os.PathLike) -> Any:
             raise ValueError(f"{path} holds no plan: {error}") from error
     yaml = _yaml()
 
-    class Loader(yaml.SafeLoader):
+    class Loader(yaml.SafeLoader):  # type: ignore[name-defined]
         def construct_mapping(self, node, deep=False):
             keys = [self.construct_object(key, deep=True) for key, _ in node.value]
             _without_repetition([(str(key), None) for key in keys])

@@ -13,9 +13,9 @@ class Difference(NamedTuple):
     """A leaf that two plans treat differently.
 
     Attributes:
-        leaf: its path.
-        first: what the first plan does with it, as in ``fraction(omega=0.2)``.
-        second: what the second does.
+      leaf: its path.
+      first: what the first plan does with it, as in `fraction(omega=0.2)`.
+      second: what the second does.
     """
 
     leaf: str
@@ -41,15 +41,15 @@ def diff(first: Plan, second: Plan, target: PyTree) -> PlanDifference:
     same leaves, or other notes, make no difference.
 
     Args:
-        first: a plan.
-        second: another.
-        target: a tree whose leaves both claim; only its paths are read, so shapes are enough.
+      first: a plan.
+      second: another.
+      target: a tree whose leaves both claim; only its paths are read, so shapes are enough.
 
     Returns:
-        A tuple of :class:`Difference`, in tree order; empty where the plans do the same.
+      A tuple of `Difference`, in tree order; empty where the plans do the same.
 
     Raises:
-        ValueError: as :func:`transfer.claims`, of either plan.
+      ValueError: as `transfer.claims`, of either plan.
 
     >>> tree = {"body": {"w": jnp.ones(2)}, "head": {"w": jnp.ones(2)}}
     >>> one = Plan((Rule("head/*", "fraction", {"omega": 0.2}),), default="copy")
@@ -72,12 +72,12 @@ def _does(rule: Rule, path: str) -> tuple[Any, ...]:
 
 
 def outline(plan: Plan, target: PyTree, *, depth: int = 2) -> dict[str, dict[str, int]]:
-    """What becomes of each branch: ``{branch: {operation: number of leaves}}``.
+    """What becomes of each branch: `{branch: {operation: number of leaves}}`.
 
     Args:
-        plan: a plan.
-        target: a tree that it claims.
-        depth: how many parts of a path make a branch.
+      plan: a plan.
+      target: a tree that it claims.
+      depth: how many parts of a path make a branch.
 
     >>> tree = {"body": {"w": jnp.ones(2), "b": jnp.ones(2)}, "head": jnp.ones(2)}
     >>> outline(Plan((Rule("head", "keep"),), default="copy"), tree)
@@ -96,7 +96,7 @@ def to_html(plan: Plan, target: PyTree) -> str:
     Where Treescope is installed (Flax brings it) the tree folds and unfolds; else it is a table.
 
     Raises:
-        ValueError: as :func:`transfer.claims`.
+      ValueError: as `transfer.claims`.
     """
     texts = {path: rule.describe() for path, rule in claims(plan, target).items()}
     try:
@@ -135,19 +135,19 @@ def draw(plan: Plan, target: PyTree, *, axes: Any = None, components: Sequence[s
     """A picture of a plan, one column for each component and one box for each of its layers.
 
     For the recipes this is the thesis's Figure 8. Needs Matplotlib
-    (``pip install 'dreamer-transfer[pictures]'``).
+    (`pip install 'dreamer-transfer[pictures]'`).
 
     Args:
-        plan: a plan.
-        target: a tree that it claims; its first parts are the components, its second the layers.
-        axes: of Matplotlib, to draw on; by default of a new figure.
-        components: the order of columns; by default that of the tree.
+      plan: a plan.
+      target: a tree that it claims; its first parts are the components, its second the layers.
+      axes: of Matplotlib, to draw on; by default of a new figure.
+      components: the order of columns; by default that of the tree.
 
     Returns:
-        The axes.
+      The axes.
 
     Raises:
-        ValueError: as :func:`transfer.claims`, or a component that the tree has not.
+      ValueError: as `transfer.claims`, or a component that the tree has not.
     """
     import matplotlib.pyplot as plt
     from matplotlib.patches import FancyBboxPatch, Patch
@@ -162,7 +162,7 @@ def draw(plan: Plan, target: PyTree, *, axes: Any = None, components: Sequence[s
     if axes is None:
         height = 1 + 0.55 * max(map(len, columns.values()))
         _, axes = plt.subplots(figsize=(1.9 * len(columns), height), layout="constrained")
-    seen = {}
+    seen: dict[str, str] = {}
     for column, (component, layers) in enumerate(columns.items()):
         axes.text(column, 0.9, component, ha="center", va="bottom", weight="bold")
         for row, (layer, descriptions) in enumerate(layers):

@@ -1,11 +1,11 @@
 """Networks that keep learning: periodic resets, and dormant units recycled.
 
-Deep agents lose the ability to fit what is new. :func:`reset_periodically` draws layers anew every
+Deep agents lose the ability to fit what is new. `reset_periodically` draws layers anew every
 so many updates (Nikishin et al., 2022, "The Primacy Bias in Deep Reinforcement Learning");
-:func:`dormant_units` and :func:`recycle` find and restart the units that have gone silent (Sokar et
+`dormant_units` and `recycle` find and restart the units that have gone silent (Sokar et
 al., 2023, "The Dormant Neuron Phenomenon in Deep Reinforcement Learning", ReDo);
-:func:`transfer.shrink_perturb` is the third (Ash and Adams, 2020). All are pure functions of arrays
-under ``jit``, ``vmap`` and inside ``scan``.
+`transfer.shrink_perturb` is the third (Ash and Adams, 2020). All are pure functions of arrays
+under `jit`, `vmap` and inside `scan`.
 
 Axis letters: B batch; U units of a layer.
 """
@@ -26,21 +26,21 @@ Array = Any
 def reset_periodically(
     tree: PyTree, fresh: PyTree, *, step: Any, period: int, until: int | None = None, where: Where
 ) -> PyTree:
-    """The tree, with the selected leaves of ``fresh`` in every ``period``-th step.
+    """The tree, with the selected leaves of `fresh` in every `period`-th step.
 
     Call it with the parameters and with the optimiser's state, whose memory of the leaves (paths
-    such as ``0/mu/head/kernel``) ought to be reset with them.
+    such as `0/mu/head/kernel`) ought to be reset with them.
 
     Args:
-        tree: parameters, or an optimiser's state.
-        fresh: the same tree, freshly initialised.
-        step: the number of the update, from 0; may be traced. Step 0 resets nothing.
-        period: updates from one reset to the next.
-        until: the first step from which nothing is reset any more; by default none.
-        where: the leaves to reset, such as the last layers.
+      tree: parameters, or an optimiser's state.
+      fresh: the same tree, freshly initialised.
+      step: the number of the update, from 0; may be traced. Step 0 resets nothing.
+      period: updates from one reset to the next.
+      until: the first step from which nothing is reset any more; by default none.
+      where: the leaves to reset, such as the last layers.
 
     Raises:
-        ValueError: a period below 1, or ``fresh`` lacks a leaf or has it in another shape.
+      ValueError: a period below 1, or `fresh` lacks a leaf or has it in another shape.
 
     >>> tree, fresh = {"body": jnp.ones(1), "head": jnp.ones(1)}, {"head": jnp.zeros(1)}
     >>> [reset_periodically(tree, fresh, step=s, period=2, where="head")["head"].item()
@@ -69,10 +69,10 @@ def dormancy(activations: Array) -> Array:
     is silent. A layer that is silent altogether has scores of 0.
 
     Args:
-        activations: float [..., U], of a batch; for a convolution [B, height, width, U].
+      activations: float [..., U], of a batch; for a convolution [B, height, width, U].
 
     Returns:
-        float32 [U].
+      float32 [U].
 
     >>> dormancy(jnp.array([[1.0, 0.0, 3.0], [1.0, 0.0, -1.0]]))
     Array([1., 0., 2.], dtype=float32)
@@ -83,17 +83,17 @@ def dormancy(activations: Array) -> Array:
 
 
 def dormant_units(activations: Array, *, threshold: Any = 0.025) -> Array:
-    """Which units are τ-dormant: a score of ``threshold`` or less (ReDo, definition 3.1).
+    """Which units are τ-dormant: a score of `threshold` or less (ReDo, definition 3.1).
 
     Args:
-        activations: float [..., U], of a batch.
-        threshold: τ, 0 or more; 0.025 in the paper's DQN agents.
+      activations: float [..., U], of a batch.
+      threshold: τ, 0 or more; 0.025 in the paper's DQN agents.
 
     Returns:
-        bool [U].
+      bool [U].
 
     Raises:
-        ValueError: a threshold that is negative or not finite (where it is concrete).
+      ValueError: a threshold that is negative or not finite (where it is concrete).
 
     >>> dormant_units(jnp.array([[1.0, 0.0, 3.0], [1.0, 0.0, -1.0]]))
     Array([False,  True, False], dtype=bool)
@@ -116,24 +116,24 @@ def recycle(
 
     The network's function changes by no more than the dormant units contributed to it, and the
     units can learn again. To forget their moments do the same to the optimiser's state, with zeros
-    for ``fresh``, and patterns such as ``0/*/hidden/*``.
+    for `fresh`, and patterns such as `0/*/hidden/*`.
 
     Args:
-        tree: parameters, or an optimiser's state.
-        fresh: the incoming leaves, freshly initialised; other leaves are not read.
-        dormant: bool [U], from :func:`dormant_units`; may be traced.
-        incoming: pattern or patterns of the layer's own leaves (kernel and bias), with U on
-            ``incoming_axis``.
-        outgoing: pattern or patterns of the kernels that read the units, with U on
-            ``outgoing_axis``; or a multiple of U, where a convolution's channels are flattened
-            (channels last) in between.
-        incoming_axis: ``"output"`` (-1) for kernels [inputs, outputs]; -2 for Equinox and PyTorch.
-            A bias has U on its last axis always.
-        outgoing_axis: ``"input"`` (-2) for kernels [inputs, outputs]; -1 for Equinox and PyTorch.
+      tree: parameters, or an optimiser's state.
+      fresh: the incoming leaves, freshly initialised; other leaves are not read.
+      dormant: bool [U], from `dormant_units`; may be traced.
+      incoming: pattern or patterns of the layer's own leaves (kernel and bias), with U on
+        `incoming_axis`.
+      outgoing: pattern or patterns of the kernels that read the units, with U on
+        `outgoing_axis`; or a multiple of U, where a convolution's channels are flattened
+        (channels last) in between.
+      incoming_axis: `"output"` (-1) for kernels [inputs, outputs]; -2 for Equinox and PyTorch.
+        A bias has U on its last axis always.
+      outgoing_axis: `"input"` (-2) for kernels [inputs, outputs]; -1 for Equinox and PyTorch.
 
     Raises:
-        ValueError: a pattern that matches nothing, a leaf of another size, or a leaf that ``fresh``
-            lacks.
+      ValueError: a pattern that matches nothing, a leaf of another size, or a leaf that `fresh`
+        lacks.
 
     >>> tree = {"h": {"w": jnp.ones((2, 2))}, "out": {"w": jnp.ones((2, 1))}}
     >>> fresh = {"h": {"w": jnp.full((2, 2), 5.0)}}

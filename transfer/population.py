@@ -12,7 +12,7 @@ def stack(trees: Sequence[PyTree]) -> PyTree:
     """P trees as one population, every leaf [P, ...].
 
     Raises:
-        ValueError: no trees; or trees that differ in structure, or in the shape or dtype of a leaf.
+      ValueError: no trees; or trees that differ in structure, or in the shape or dtype of a leaf.
 
     >>> stack([{"w": jnp.zeros(2)}, {"w": jnp.ones(2)}])["w"].shape
     (2, 2)
@@ -37,7 +37,7 @@ def unstack(population: PyTree) -> list[PyTree]:
     """The P members of a population.
 
     Raises:
-        ValueError: the leaves do not share a leading axis.
+      ValueError: the leaves do not share a leading axis.
 
     >>> [member["w"].item() for member in unstack({"w": jnp.array([1.0, 2.0])})]
     [1.0, 2.0]
@@ -50,7 +50,7 @@ def unstack(population: PyTree) -> list[PyTree]:
 
 
 def replicate(tree: PyTree, *, size: int) -> PyTree:
-    """A population of ``size`` equal members.
+    """A population of `size` equal members.
 
     >>> replicate({"w": jnp.zeros(2)}, size=3)["w"].shape
     (3, 2)
@@ -62,11 +62,12 @@ def size(population: PyTree) -> int:
     """P, the leading axis that all leaves share.
 
     Raises:
-        ValueError: there are no leaves, or their leading axes differ.
+      ValueError: there are no leaves, or their leading axes differ.
     """
-    sizes = {
+    sizes: dict[str, int | None] = {
         path: leaf.shape[0] if leaf.shape else None for path, leaf in flatten(population).items()
     }
-    if len(set(sizes.values())) != 1 or None in sizes.values():
+    found = next(iter(sizes.values()), None)
+    if found is None or len(set(sizes.values())) != 1:
         raise ValueError(f"The leaves of a population must share a leading axis, got {sizes}.")
-    return next(iter(sizes.values()))
+    return found

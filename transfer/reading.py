@@ -91,7 +91,7 @@ class View(Leaves):
 
 
 def flat_sources(plan: Plan, source: PyTree) -> dict[str | None, Mapping[str, Array]]:
-    """The sources by name, flat; ``None`` names the only one."""
+    """The sources by name, flat; `None` names the only one."""
     named = any(reading.name is not None for rule in plan.rules for reading in rule.readings)
     if source is None:
         return {}
@@ -166,10 +166,10 @@ def source_places(
     """The paths in a source that a leaf of the target is made from.
 
     Args:
-        rule: the rule that claims the leaf.
-        path: the leaf's path.
-        tree: the source's leaves by path.
-        number: which of the rule's entries for its sources is meant; ``None`` for all together.
+      rule: the rule that claims the leaf.
+      path: the leaf's path.
+      tree: the source's leaves by path.
+      number: which of the rule's entries for its sources is meant; `None` for all together.
     """
     readings = rule.readings if number is None else (rule.readings[number],)
     found: list[str] = []

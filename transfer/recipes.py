@@ -8,7 +8,7 @@ The paths are those of a Dreamer agent whose parameters are one dictionary:
     {reward, value, dynamics}/stored/{params/..., present}             (where it is a meta-model)
 
 This module knows these names and nothing else of the agent. The target of every recipe is a
-freshly initialised tree, so that ``keep`` is random initialisation. Optimiser state is fresh.
+freshly initialised tree, so that `keep` is random initialisation. Optimiser state is fresh.
 """
 
 from collections.abc import Sequence
@@ -44,15 +44,15 @@ def fractional_transfer(
     everywhere, so neither must it be drawn anew nor should it be taken over whole.
 
     Args:
-        omega: ω in [0, 1], a scalar; or [P] for a stacked population. ``None`` leaves it open, to
-            be given as ``apply(plan, target, source, omega=...)``, where it may be traced.
-        fractions: the components whose last layer is fractionally transferred. Beyond the
-            thesis: without "reward" or "value" that last layer is drawn anew; "dynamics" adds the
-            last layers of prior and posterior; "actor" the actor's, where the action sizes of
-            source and target are the same.
+      omega: ω in [0, 1], a scalar; or [P] for a stacked population. `None` leaves it open, to
+        be given as `apply(plan, target, source, omega=...)`, where it may be traced.
+      fractions: the components whose last layer is fractionally transferred. Beyond the
+        thesis: without "reward" or "value" that last layer is drawn anew; "dynamics" adds the
+        last layers of prior and posterior; "actor" the actor's, where the action sizes of
+        source and target are the same.
 
     Raises:
-        ValueError: an unknown component in ``fractions``.
+      ValueError: an unknown component in `fractions`.
     """
     for component in fractions:
         if component not in _LAST_LAYERS:
@@ -102,19 +102,19 @@ def fractional_transfer(
 def universal_autoencoder(dynamics: Dynamics = "fresh") -> Plan:
     """A target on the autoencoder of an agent trained on several tasks (thesis §3.3.1, Figure 9).
 
-    Encoder and decoder are copied; the encoder is frozen (see :func:`transfer.frozen`), so that all
+    Encoder and decoder are copied; the encoder is frozen (see `transfer.frozen`), so that all
     agents made by this recipe share one feature space; the decoder trains on. Heads are fresh. The
     agents whose models are stored, the target of a meta-model, and those that latent task
     classification samples are all made by it.
 
     Args:
-        dynamics: ``"fresh"`` as in the author's runs: only the encoder's embedding is universal,
-            while the latent state that heads read is each agent's own. ``"copied"``: each agent
-            starts from the source's dynamics. ``"frozen"``: and keeps them, but for the kernel of
-            the action, which is always fresh and trains.
+      dynamics: `"fresh"` as in the author's runs: only the encoder's embedding is universal,
+        while the latent state that heads read is each agent's own. `"copied"`: each agent
+        starts from the source's dynamics. `"frozen"`: and keeps them, but for the kernel of
+        the action, which is always fresh and trains.
 
     Raises:
-        ValueError: another value of ``dynamics``.
+      ValueError: another value of `dynamics`.
     """
     heads = (
         Rule("reward/**", "keep", note="random"),
@@ -134,22 +134,22 @@ def meta_model(
 ) -> Plan:
     """A target whose models read what stored models predict (thesis §3.3.2, equation 20, Figure 9).
 
-    As :func:`universal_autoencoder`, and each of the components is a meta-model: it has the frozen
-    models of N source tasks among its own parameters, under ``stored``, and all others fresh. Two
-    sources are given by name: ``apply(plan, target, {"autoencoder": ..., "stored": ...})``, the
-    second with the leaves ``reward/stored/params/...`` [N, ...] and ``reward/stored/present`` [N]
-    (see :func:`transfer.meta_model.store`).
+    As `universal_autoencoder`, and each of the components is a meta-model: it has the frozen
+    models of N source tasks among its own parameters, under `stored`, and all others fresh. Two
+    sources are given by name: `apply(plan, target, {"autoencoder": ..., "stored": ...})`, the
+    second with the leaves `reward/stored/params/...` [N, ...] and `reward/stored/present` [N]
+    (see `transfer.meta_model.store`).
 
     Args:
-        dynamics: as for :func:`universal_autoencoder`.
-        components: which models are meta-models: ``"reward"``, and beyond the thesis ``"value"``
-            and ``"dynamics"``, whose kernel on the predictions is ``dynamics/stored_in``.
-        switching: whether the reward model also holds a classifier of tasks, under
-            ``reward/classifier``, by which it leaves known tasks to their stored models.
+      dynamics: as for `universal_autoencoder`.
+      components: which models are meta-models: `"reward"`, and beyond the thesis `"value"`
+        and `"dynamics"`, whose kernel on the predictions is `dynamics/stored_in`.
+      switching: whether the reward model also holds a classifier of tasks, under
+        `reward/classifier`, by which it leaves known tasks to their stored models.
 
     Raises:
-        ValueError: another value of ``dynamics``, an unknown component, or switching without a
-            meta-model of the reward.
+      ValueError: another value of `dynamics`, an unknown component, or switching without a
+        meta-model of the reward.
     """
     if unknown := sorted(set(components) - {"reward", "value", "dynamics"}):
         raise ValueError(f"There is no meta-model for {unknown}; choose reward, value, dynamics.")
@@ -225,7 +225,7 @@ LATENT_TASK_THRESHOLDS = (50.0, 70.0, 90.0)
 
 
 def latent_task_thresholds(features: int) -> tuple[float, ...]:
-    """The thesis's ξ for M = ``features``: a Manhattan distance grows with the size, ξ·M/230.
+    """The thesis's ξ for M = `features`: a Manhattan distance grows with the size, ξ·M/230.
 
     >>> latent_task_thresholds(115)
     (25.0, 35.0, 45.0)

@@ -23,15 +23,15 @@ class Row(NamedTuple):
     """What is known of a leaf before any number is computed.
 
     Attributes:
-        leaf: its path.
-        rule: the patterns of the rule that claims it.
-        operation: the name of the rule's operation.
-        shape: its shape.
-        frozen: whether the rule calls it frozen.
-        rule_number: which entry of the report's ``settings`` and ``parameters`` is the rule's.
-        source: the path or paths that it was made from, where they are not its own.
-        columns: the numbers that there are for it: no norm for PRNG keys, none of a source that
-            was not read, no cosine to one of another shape.
+      leaf: its path.
+      rule: the patterns of the rule that claims it.
+      operation: the name of the rule's operation.
+      shape: its shape.
+      frozen: whether the rule calls it frozen.
+      rule_number: which entry of the report's `settings` and `parameters` is the rule's.
+      source: the path or paths that it was made from, where they are not its own.
+      columns: the numbers that there are for it: no norm for PRNG keys, none of a source that
+        was not read, no cosine to one of another shape.
     """
 
     leaf: str
@@ -46,21 +46,21 @@ class Row(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What happened to each leaf. A pytree, so ``jit`` and ``vmap`` can return it.
+    """What happened to each leaf. A pytree, so `jit` and `vmap` can return it.
 
     Attributes:
-        rows: one per leaf, in tree order; static.
-        settings: for each rule its parameters that are not numbers; static.
-        parameters: for each rule its numbers, such as ``{"omega": 0.2}``.
-        norm_before: Euclidean norm of each leaf of the target, float32 [n].
-        norm_after: the same of the result, float32 [n].
-        norm_source: the same of the source, float32 [n].
-        cosine_to_source: cosine between result and source, float32 [n]; 0 where either is zero.
-        unread: the leaves of the source that no rule reads, as ``path``, or as ``name/path`` where
-            sources have names; static.
+      rows: one per leaf, in tree order; static.
+      settings: for each rule its parameters that are not numbers; static.
+      parameters: for each rule its numbers, such as `{"omega": 0.2}`.
+      norm_before: Euclidean norm of each leaf of the target, float32 [n].
+      norm_after: the same of the result, float32 [n].
+      norm_source: the same of the source, float32 [n].
+      cosine_to_source: cosine between result and source, float32 [n]; 0 where either is zero.
+      unread: the leaves of the source that no rule reads, as `path`, or as `name/path` where
+        sources have names; static.
 
-    Where a number does not exist (see :class:`Row`) the array holds NaN, the records ``None`` and
-    the table a dash. For a population, or out of ``vmap``, all arrays have a leading axis P.
+    Where a number does not exist (see `Row`) the array holds NaN, the records `None` and
+    the table a dash. For a population, or out of `vmap`, all arrays have a leading axis P.
     """
 
     rows: tuple[Row, ...]
@@ -74,7 +74,7 @@ class Report:
 
     @property
     def members(self) -> int | None:
-        """P, or ``None`` for the report of a single tree."""
+        """P, or `None` for the report of a single tree."""
         return self.norm_after.shape[0] if self.norm_after.ndim > 1 else None
 
     def member(self, index: int) -> "Report":
@@ -87,7 +87,7 @@ class Report:
         """One dictionary per leaf, of plain Python values; lists of P of them for a population.
 
         Raises:
-            ValueError: inside a traced function, where there are no values yet.
+          ValueError: inside a traced function, where there are no values yet.
         """
         self._require_values()
         columns = {name: np.asarray(getattr(self, name)) for name in _COLUMNS}
@@ -131,11 +131,11 @@ class Report:
         if self.members is not None:
             footer += f"; numbers are means over {self.members} members"
         rule = "-" * max(map(len, aligned))
-        lines = [aligned[0], rule, *aligned[1:], rule, footer]
+        table = [aligned[0], rule, *aligned[1:], rule, footer]
         if self.unread:
             more = f", ... ({len(self.unread)} in all)" if len(self.unread) > 8 else ""
-            lines.append(f"not read of the source: {', '.join(self.unread[:8])}{more}")
-        return "\n".join(lines)
+            table.append(f"not read of the source: {', '.join(self.unread[:8])}{more}")
+        return "\n".join(table)
 
     def _line(self, record: dict[str, Any]) -> tuple[str, ...]:
         arguments = ", ".join(
@@ -233,11 +233,11 @@ def summarise(
     """The report of a change.
 
     Args:
-        rows: one per leaf, in tree order.
-        arguments: the keyword arguments of each rule's operation.
-        measured: the numbers of the leaves by column and path, from :func:`measure_leaves`.
-        members: P where leaves are stacked on a leading axis.
-        unread: the leaves of the source that no rule reads.
+      rows: one per leaf, in tree order.
+      arguments: the keyword arguments of each rule's operation.
+      measured: the numbers of the leaves by column and path, from `measure_leaves`.
+      members: P where leaves are stacked on a leading axis.
+      unread: the leaves of the source that no rule reads.
     """
     split = [_split_parameters(values, members) for values in arguments]
     missing = np.full(() if members is None else (members,), np.nan, np.float32)
@@ -270,10 +270,10 @@ def measure_leaves(
     """The numbers of a report: column -> path -> float32, a scalar or [P].
 
     Args:
-        before: the target's leaves by path.
-        after: the result's leaves by path.
-        source: the source's leaves that were read, by path.
-        population: whether leaves are stacked on a leading axis P.
+      before: the target's leaves by path.
+      after: the result's leaves by path.
+      source: the source's leaves that were read, by path.
+      population: whether leaves are stacked on a leading axis P.
     """
     before, after, source = map(_numbers, (before, after, source))
     source = {path: beside(leaf, after[path]) for path, leaf in source.items()}

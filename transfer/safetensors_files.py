@@ -1,4 +1,4 @@
-"""Arrays in ``.safetensors`` files: a length, a JSON header, and the bytes of all arrays.
+"""Arrays in `.safetensors` files: a length, a JSON header, and the bytes of all arrays.
 
 The format is read and written here, not by the package of that name, for what that cannot do: give
 NumPy 8-bit floating-point numbers, read one array without mapping the whole file, and keep a
@@ -44,7 +44,7 @@ _CHECKSUMS = "sha256"
 def _checksum(name: str, array: np.ndarray) -> str:
     """SHA-256 of an array with its name, dtype and shape, in hexadecimal."""
     digest = hashlib.sha256(json.dumps([name, _NAMES[array.dtype], list(array.shape)]).encode())
-    digest.update(array.reshape(-1).view(np.uint8))
+    digest.update(array.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 
@@ -74,7 +74,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(len(text).to_bytes(8, "little") + text)
         for _, array in packed:
-            file.write(array.reshape(-1).view(np.uint8))
+            file.write(array.reshape(-1).view(np.uint8).data)
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class SafetensorsFile(ArrayFile):
-    """A ``.safetensors`` file. The checksum of an array is compared whenever it is read."""
+    """A `.safetensors` file. The checksum of an array is compared whenever it is read."""
 
     def __init__(self, path: Path, max_bytes: int | None):
         super().__init__(path, max_bytes)
@@ -139,7 +139,7 @@ class SafetensorsFile(ArrayFile):
         with damage(self._path, name):
             array = np.empty(shape.shape, shape.dtype)
             self._file.seek(self._start + self._offsets[name])
-            if self._file.readinto(memoryview(array.reshape(-1).view(np.uint8))) != array.nbytes:
+            if self._file.readinto(array.reshape(-1).view(np.uint8).data) != array.nbytes:
                 raise ValueError("the file ends before it")
             if self._checksums is None:
                 return array

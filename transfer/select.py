@@ -1,16 +1,16 @@
 """Which leaves of a pytree: '/'-joined paths, glob patterns and masks.
 
-A leaf's *path* is its JAX key path joined by '/': ``reward/out/kernel`` in nested dictionaries,
-``layers/0/weight`` in an Equinox module, ``0/mu/reward/out/kernel`` in the state of an Optax chain.
-The box that Flax NNX puts around an array (``nnx.Variable``) is not part of the path, so the same
+A leaf's *path* is its JAX key path joined by '/': `reward/out/kernel` in nested dictionaries,
+`layers/0/weight` in an Equinox module, `0/mu/reward/out/kernel` in the state of an Optax chain.
+The box that Flax NNX puts around an array (`nnx.Variable`) is not part of the path, so the same
 layer has the same path in linen and in NNX. An array that an NNX module holds in two places (tied
-weights) is one leaf, as in ``nnx.state``: it has the path of the first place, and what changes it
+weights) is one leaf, as in `nnx.state`: it has the path of the first place, and what changes it
 changes both.
 
-Patterns over paths are described in :mod:`transfer.patterns`.
+Patterns over paths are described in `transfer.patterns`.
 
-A *mask* is the same pytree with a ``bool`` in place of every leaf. Selections are static: they
-depend on the structure of a tree and never on its values, so they cost nothing under ``jit``.
+A *mask* is the same pytree with a `bool` in place of every leaf. Selections are static: they
+depend on the structure of a tree and never on its values, so they cost nothing under `jit`.
 
 Only arrays are leaves here. Python numbers, strings and functions inside a tree (the activation of
 an Equinox module) are settings: they have no path, no mask selects them, no operation moves them.
@@ -44,9 +44,9 @@ def _is_nnx_variable(node: Any) -> bool:
 
 
 class Leaves(Mapping[str, Any]):
-    """A flat ``{path: array}`` whose arrays are made when they are asked for, such as a file's.
+    """A flat `{path: array}` whose arrays are made when they are asked for, such as a file's.
 
-    Every operation takes one as a source. A subclass has ``shapes``, which say what is there
+    Every operation takes one as a source. A subclass has `shapes`, which say what is there
     without making it.
     """
 
@@ -57,7 +57,7 @@ class Leaves(Mapping[str, Any]):
 
 
 class _Entry(NamedTuple):
-    """A JAX leaf of a tree. ``tied``: the same array came before, under this path."""
+    """A JAX leaf of a tree. `tied`: the same array came before, under this path."""
 
     path: str
     leaf: Any
@@ -94,7 +94,7 @@ def flatten(tree: PyTree) -> Mapping[str, Any]:
     rename or drop entries to fit a checkpoint whose names differ.
 
     Raises:
-        ValueError: two leaves have the same path, as in ``{"a/b": x, "a": {"b": y}}``.
+      ValueError: two leaves have the same path, as in `{"a/b": x, "a": {"b": y}}`.
 
     >>> flatten({"actor": {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}}).keys()
     dict_keys(['actor/bias', 'actor/kernel'])
@@ -114,12 +114,12 @@ def flatten(tree: PyTree) -> Mapping[str, Any]:
 
 
 def unflatten(tree: PyTree, leaves: Mapping[str, Any]) -> PyTree:
-    """``tree`` with the leaves named in ``leaves`` put in place of its own.
+    """`tree` with the leaves named in `leaves` put in place of its own.
 
     Tied weights of NNX modules stay tied.
 
     Raises:
-        ValueError: a name in ``leaves`` is no path of the tree.
+      ValueError: a name in `leaves` is no path of the tree.
 
     >>> unflatten({"a": jnp.zeros(2), "b": jnp.zeros(2)}, {"b": jnp.ones(2)})
     {'a': Array([0., 0.], dtype=float32), 'b': Array([1., 1.], dtype=float32)}
@@ -142,16 +142,17 @@ def _rebuild(tree: PyTree, leaves: Sequence[Any]) -> PyTree:
     """The tree with other JAX leaves. What it holds twice, it holds twice again."""
     boxes, outer = jax.tree.flatten(tree, is_leaf=_is_nnx_variable)
     if not any(map(_is_nnx_variable, boxes)):
-        return outer.unflatten(leaves)
-    remaining, filled, made = iter(leaves), [], {}
+        return jax.tree.unflatten(outer, leaves)
+    remaining, filled = iter(leaves), []
+    made: dict[int, Any] = {}
     for box in boxes:
         if not _is_nnx_variable(box):
             filled.append(next(remaining))
             continue
-        inner = jax.tree.structure(box)
-        new = inner.unflatten([next(remaining) for _ in range(inner.num_leaves)])
+        held, inner = jax.tree.flatten(box)
+        new = jax.tree.unflatten(inner, [next(remaining) for _ in held])
         filled.append(made.setdefault(id(box), new))
-    return outer.unflatten(filled)
+    return jax.tree.unflatten(outer, filled)
 
 
 def paths(tree: PyTree) -> tuple[str, ...]:
@@ -167,17 +168,17 @@ def select(tree: PyTree, *patterns: str | Sequence[str], count: int | None = Non
     """A mask of the leaves whose paths match the patterns.
 
     Args:
-        tree: any pytree; of its arrays only the paths are read.
-        *patterns: glob patterns, or lists of them, applied in order: a plain one adds leaves, one
-            that begins with ``!`` takes them away. If the first begins with ``!``, all leaves are
-            the start.
-        count: the number of leaves there ought to be.
+      tree: any pytree; of its arrays only the paths are read.
+      *patterns: glob patterns, or lists of them, applied in order: a plain one adds leaves, one
+        that begins with `!` takes them away. If the first begins with `!`, all leaves are
+        the start.
+      count: the number of leaves there ought to be.
 
     Returns:
-        The tree with ``True`` at the selected leaves and ``False`` at all others.
+      The tree with `True` at the selected leaves and `False` at all others.
 
     Raises:
-        ValueError: a pattern matches nothing, or the number of leaves is not ``count``.
+      ValueError: a pattern matches nothing, or the number of leaves is not `count`.
 
     >>> tree = {"gru": {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)}, "out": jnp.ones(2)}
     >>> select(tree, "**", "!**/bias", count=2)
@@ -195,21 +196,21 @@ def select(tree: PyTree, *patterns: str | Sequence[str], count: int | None = Non
 
 
 def mask_of(tree: PyTree, chosen: Iterable[str]) -> Mask:
-    """The mask that is ``True`` at exactly the given paths."""
+    """The mask that is `True` at exactly the given paths."""
     chosen = frozenset(chosen)
     flags = [is_array(entry.leaf) and entry.path in chosen for entry in _entries(tree)]
     return _rebuild(tree, flags)
 
 
 def selected(tree: PyTree, where: Where = None) -> frozenset[str]:
-    """The paths that ``where`` names in a tree.
+    """The paths that `where` names in a tree.
 
     Args:
-        tree: any pytree.
-        where: ``None`` for every leaf, one pattern, a sequence of patterns, or a mask.
+      tree: any pytree.
+      where: `None` for every leaf, one pattern, a sequence of patterns, or a mask.
 
     Raises:
-        ValueError: a mask whose structure is not the tree's, or a pattern that matches nothing.
+      ValueError: a mask whose structure is not the tree's, or a pattern that matches nothing.
 
     >>> sorted(selected({"a": jnp.ones(1), "b": jnp.ones(1)}, "!a"))
     ['b']
@@ -237,7 +238,7 @@ def selected(tree: PyTree, where: Where = None) -> frozenset[str]:
 
 
 def split(tree: PyTree, chosen: Iterable[str]) -> tuple[PyTree, PyTree]:
-    """The tree with only the chosen leaves, and with all others; ``None`` for what is left out."""
+    """The tree with only the chosen leaves, and with all others; `None` for what is left out."""
     chosen = frozenset(chosen)
     entries = _entries(tree)
     flags = [is_array(entry.leaf) and entry.path in chosen for entry in entries]
@@ -247,7 +248,7 @@ def split(tree: PyTree, chosen: Iterable[str]) -> tuple[PyTree, PyTree]:
 
 
 def join(choose: Callable[..., Any], parts: Sequence[PyTree]) -> PyTree:
-    """``choose`` of the leaves of trees from :func:`split`, ``None`` being a leaf."""
+    """`choose` of the leaves of trees from `split`, `None` being a leaf."""
     is_box = lambda node: node is None or _is_nnx_variable(node)  # noqa: E731
     flat = [jax.tree.flatten(part, is_leaf=is_box) for part in parts]
     if len({structure for _, structure in flat}) != 1:
@@ -259,14 +260,16 @@ def join(choose: Callable[..., Any], parts: Sequence[PyTree]) -> PyTree:
         # What every part holds twice stays one thing.
         key = tuple(map(id, together))
         boxes.append(made.setdefault(key, whole) if _is_nnx_variable(together[0]) else whole)
-    return flat[0][1].unflatten(boxes)
+    return jax.tree.unflatten(flat[0][1], boxes)
 
 
 def same_structure(name: str, tree: PyTree, other_name: str, other: PyTree) -> None:
-    if jax.tree.structure(tree) != jax.tree.structure(other):
+    # JAX's hints do not say that structures compare.
+    got: Any = jax.tree.structure(tree)
+    expected: Any = jax.tree.structure(other)
+    if got != expected:
         raise ValueError(
-            f"The structure of {name} is not that of {other_name}: got "
-            f"{jax.tree.structure(tree)}, expected {jax.tree.structure(other)}."
+            f"The structure of {name} is not that of {other_name}: got {got}, expected {expected}."
         )
 
 
@@ -298,9 +301,9 @@ def complement(mask: Mask, *, tree: PyTree = None) -> Mask:
     """Leaves that are not in the mask.
 
     Args:
-        mask: a mask.
-        tree: the tree it belongs to; needed only where a tree holds leaves that are not arrays,
-            which belong to no mask and not to its complement either.
+      mask: a mask.
+      tree: the tree it belongs to; needed only where a tree holds leaves that are not arrays,
+        which belong to no mask and not to its complement either.
 
     >>> complement({"a": True, "b": False})
     {'a': False, 'b': True}

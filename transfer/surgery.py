@@ -1,27 +1,27 @@
 """Operations that make a new tree from a target and a source.
 
-Every operation is a pure function ``operation(target, source, *, ..., where=None)``: ``target`` is
-the tree to change (usually freshly initialised), ``source`` the tree that knowledge comes from, and
-``where`` selects leaves of the target: a mask, a pattern, several patterns, or ``None`` for all.
+Every operation is a pure function `operation(target, source, *, ..., where=None)`: `target` is
+the tree to change (usually freshly initialised), `source` the tree that knowledge comes from, and
+`where` selects leaves of the target: a mask, a pattern, several patterns, or `None` for all.
 
-* The result has the target's structure, shapes, dtypes and sharding. Leaves outside ``where`` are
+* The result has the target's structure, shapes, dtypes and sharding. Leaves outside `where` are
   the very objects of the target; the others are JAX arrays. Arguments are never changed.
 * What is copied whole is not copied in memory: where dtype and place agree, the result holds the
   source's own array. Arrays never change, so this shows only where one is donated: donating the
-  result (``jax.jit(..., donate_argnums=...)``) takes the buffers of the source too, and of the
-  target's leaves that were left as they were. Donate ``jax.tree.map(jnp.copy, result)`` to keep
+  result (`jax.jit(..., donate_argnums=...)`) takes the buffers of the source too, and of the
+  target's leaves that were left as they were. Donate `jax.tree.map(jnp.copy, result)` to keep
   both. NumPy arrays, which can change, are always copied.
 * Leaves of the source are found by path, so it may have another structure, lack what is not
-  needed, or be a flat ``{path: array}``.
+  needed, or be a flat `{path: array}`.
 * Nothing broadcasts. Leaves of different shape are an error that names path and both shapes.
 * Arithmetic runs in float32 at least, whatever the dtype, and is rounded once to the target's. A
-  dtype that cannot hold the values is an error where they are concrete (``casting``).
-* Numbers such as ``omega`` have a range and are finite, which is checked where they are concrete.
+  dtype that cannot hold the values is an error where they are concrete (`casting`).
+* Numbers such as `omega` have a range and are finite, which is checked where they are concrete.
   They may be traced and differentiated. A number may differ between leaves: a mapping
-  ``{path, branch or pattern: number}``, or a tree such as the target's own.
-* All of it works under ``jit``, ``vmap`` and ``grad``; only ``where``, axes and indices are static.
+  `{path, branch or pattern: number}`, or a tree such as the target's own.
+* All of it works under `jit`, `vmap` and `grad`; only `where`, axes and indices are static.
 
-A *population* is a tree whose leaves are stacked on a leading axis P. With ``population=True`` each
+A *population* is a tree whose leaves are stacked on a leading axis P. With `population=True` each
 number may be one value per member [P] and a key may be [P] of them; without it they are scalars and
 one key, so that a vector never scales the rows of a matrix by mistake. Axes are counted from the
 end, and mean the same for one tree and for a population.
@@ -57,7 +57,7 @@ from transfer.values import numbers, per_member
 
 
 def change(target: PyTree, where: Where, leaf_operation: Callable[[str, Array], Array]) -> PyTree:
-    """The target with ``leaf_operation(path, leaf)`` in place of each selected leaf."""
+    """The target with `leaf_operation(path, leaf)` in place of each selected leaf."""
     leaves = flatten(target)
     chosen = selected(target, where)
     return unflatten(
@@ -77,7 +77,7 @@ def _mix(
 ) -> PyTree:
     """An arithmetic operation on pairs of equal shape, in float32 at least.
 
-    ``formula(path, target, source, *numbers)``; ``values`` are its numbers by name, each with the
+    `formula(path, target, source, *numbers)`; `values` are its numbers by name, each with the
     greatest that is allowed; the least is 0.
     """
     sources, names, chosen = flatten(source), paths(target), selected(target, where)
@@ -118,16 +118,16 @@ def copy(
     """The source's leaves in place of the target's: full transfer.
 
     Args:
-        target: the tree to change.
-        source: the tree that is copied from.
-        casting: what a difference of dtype may do, as in NumPy: ``"no"`` difference at all;
-            ``"same_kind"`` (rounding, but neither a fraction to an integer nor a complex number to
-            a real one, nor a value to a dtype that cannot hold it, such as 1e6 to float16);
-            ``"unsafe"``, anything.
-        where: the leaves to change.
+      target: the tree to change.
+      source: the tree that is copied from.
+      casting: what a difference of dtype may do, as in NumPy: `"no"` difference at all;
+        `"same_kind"` (rounding, but neither a fraction to an integer nor a complex number to
+        a real one, nor a value to a dtype that cannot hold it, such as 1e6 to float16);
+        `"unsafe"`, anything.
+      where: the leaves to change.
 
     Raises:
-        ValueError: a leaf is missing in the source, has another shape, or would lose its values.
+      ValueError: a leaf is missing in the source, has another shape, or would lose its values.
 
     >>> copy({"w": jnp.zeros(2), "b": jnp.zeros(1)}, {"w": jnp.ones(2)}, where="w")
     {'b': Array([0.], dtype=float32), 'w': Array([1., 1.], dtype=float32)}
@@ -148,16 +148,16 @@ def fraction(
     """Fractional transfer, W_T + ω·W_S (thesis §3.2.2, equation 19).
 
     Args:
-        target: tree of W_T, freshly initialised.
-        source: tree of W_S, trained.
-        omega: ω in [0, 1], a scalar; one value per member [P] of a population; or such a number for
-            each leaf, as a mapping or tree. Traced or not.
-        population: whether the leaves are stacked on an axis P.
-        where: the leaves to change.
+      target: tree of W_T, freshly initialised.
+      source: tree of W_S, trained.
+      omega: ω in [0, 1], a scalar; one value per member [P] of a population; or such a number for
+        each leaf, as a mapping or tree. Traced or not.
+      population: whether the leaves are stacked on an axis P.
+      where: the leaves to change.
 
     Raises:
-        ValueError: a leaf is missing in the source, has another shape, or is not floating point;
-            or ω is out of range.
+      ValueError: a leaf is missing in the source, has another shape, or is not floating point;
+        or ω is out of range.
 
     >>> fraction({"w": jnp.ones(2)}, {"w": jnp.array([1.0, 2.0])}, omega=0.5)
     {'w': Array([1.5, 2. ], dtype=float32)}
@@ -174,7 +174,7 @@ def interpolate(
 ) -> PyTree:
     """(1 - weight)·target + weight·source: the target at 0, the source at 1.
 
-    ``weight`` is in [0, 1], given as ``omega`` of :func:`fraction`. Repeated with a small weight
+    `weight` is in [0, 1], given as `omega` of `fraction`. Repeated with a small weight
     this is the moving average of target networks.
 
     >>> interpolate({"w": jnp.zeros(2)}, {"w": jnp.array([1.0, 2.0])}, weight=0.25)
@@ -199,7 +199,7 @@ def shrink_perturb(
 ) -> PyTree:
     """shrink·source + noise·N(0, 1): a warm start that can still learn (Ash and Adams, 2020).
 
-    ``shrink`` is in [0, 1] and ``noise`` 0 or more, given as ``omega`` of :func:`fraction`. The
+    `shrink` is in [0, 1] and `noise` 0 or more, given as `omega` of `fraction`. The
     draw of a leaf depends on the key and the leaf's path alone.
 
     >>> shrink_perturb({"w": jnp.ones(2)}, {"w": jnp.array([1.0, 2.0])}, shrink=0.5, noise=0.0,
@@ -234,15 +234,15 @@ def reinitialise(
     """Freshly drawn leaves. The draw of a leaf depends on the key and the leaf's path alone.
 
     Args:
-        target: any tree.
-        initializer: ``initializer(key, shape, dtype) -> array``, as in ``jax.nn.initializers``;
-            or the name of one (a key of ``INITIALIZERS``); or ``{"name": ..., **arguments}``.
-        key: one key; or [P] of them for a population, whose members are drawn one by one.
-        population: whether the leaves are stacked on an axis P.
-        where: the leaves to draw.
+      target: any tree.
+      initializer: `initializer(key, shape, dtype) -> array`, as in `jax.nn.initializers`;
+        or the name of one (a key of `INITIALIZERS`); or `{"name": ..., **arguments}`.
+      key: one key; or [P] of them for a population, whose members are drawn one by one.
+      population: whether the leaves are stacked on an axis P.
+      where: the leaves to draw.
 
     Raises:
-        ValueError: the name is unknown, or a leaf has too few axes for the initializer.
+      ValueError: the name is unknown, or a leaf has too few axes for the initializer.
 
     >>> reinitialise({"w": jnp.ones(2), "b": jnp.ones(1)}, initializer="zeros",
     ...              key=jax.random.key(0), where="w")
@@ -276,15 +276,15 @@ def take(
     """Rows or columns of the source as whole leaves of a smaller target.
 
     Args:
-        target: the tree whose leaves are replaced.
-        source: leaves at least as large along ``axis``.
-        axis: ``"input"`` (rows of a kernel, -2), ``"output"`` (columns, -1), or a number.
-        indices: positions along the axis of the source: ``"0:30"``, a slice, or integers.
-        casting: as for :func:`copy`.
-        where: the leaves to change.
+      target: the tree whose leaves are replaced.
+      source: leaves at least as large along `axis`.
+      axis: `"input"` (rows of a kernel, -2), `"output"` (columns, -1), or a number.
+      indices: positions along the axis of the source: `"0:30"`, a slice, or integers.
+      casting: as for `copy`.
+      where: the leaves to change.
 
     Raises:
-        ValueError: what is taken has not the shape of the target's leaf.
+      ValueError: what is taken has not the shape of the target's leaf.
 
     >>> source = {"w": jnp.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])}
     >>> take({"w": jnp.zeros((2, 2))}, source, axis="input", indices=[2, 0])
@@ -320,16 +320,16 @@ def splice(
     keeps its own rows for the actions.
 
     Args:
-        target: the tree to change.
-        source: leaves that may differ in size along ``axis`` only.
-        axis: ``"input"`` (rows of a kernel, -2), ``"output"`` (columns, -1), or a number.
-        indices: positions in the target: ``"0:30"``, a slice, or integers.
-        source_indices: as many positions in the source; by default the same.
-        casting: as for :func:`copy`.
-        where: the leaves to change.
+      target: the tree to change.
+      source: leaves that may differ in size along `axis` only.
+      axis: `"input"` (rows of a kernel, -2), `"output"` (columns, -1), or a number.
+      indices: positions in the target: `"0:30"`, a slice, or integers.
+      source_indices: as many positions in the source; by default the same.
+      casting: as for `copy`.
+      where: the leaves to change.
 
     Raises:
-        ValueError: positions that do not exist, repeat, or do not pair up.
+      ValueError: positions that do not exist, repeat, or do not pair up.
 
     >>> source = {"w": jnp.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])}
     >>> splice({"w": jnp.zeros((2, 2))}, source, axis="input", indices="0:1")
@@ -369,17 +369,17 @@ def pad(
     """A source with fewer actions in a target with more: the source first, then the filling.
 
     Args:
-        target: the larger tree.
-        source: leaves smaller along ``axis``, equal in all others.
-        axis: ``"input"`` (-2), ``"output"`` (-1), or a number.
-        fill: the value of what is left; ``None`` leaves the target's own values there.
-        groups: the number of equal blocks along the axis that are padded one by one: 2 for a
-            layer whose outputs are A means followed by A standard deviations.
-        casting: as for :func:`copy`.
-        where: the leaves to change.
+      target: the larger tree.
+      source: leaves smaller along `axis`, equal in all others.
+      axis: `"input"` (-2), `"output"` (-1), or a number.
+      fill: the value of what is left; `None` leaves the target's own values there.
+      groups: the number of equal blocks along the axis that are padded one by one: 2 for a
+        layer whose outputs are A means followed by A standard deviations.
+      casting: as for `copy`.
+      where: the leaves to change.
 
     Raises:
-        ValueError: the source is larger, differs in another axis, or ``groups`` does not divide.
+      ValueError: the source is larger, differs in another axis, or `groups` does not divide.
 
     >>> pad({"b": jnp.zeros(6)}, {"b": jnp.array([1.0, 2.0, 3.0, 4.0])}, axis=-1, groups=2)
     {'b': Array([1., 2., 0., 3., 4., 0.], dtype=float32)}
@@ -398,7 +398,7 @@ def crop(
 ) -> PyTree:
     """A source with more actions in a target with fewer: the first ones of the source.
 
-    Arguments and errors as for :func:`pad`, the other way round.
+    Arguments and errors as for `pad`, the other way round.
 
     >>> crop({"b": jnp.zeros(2)}, {"b": jnp.array([1.0, 2.0, 3.0, 4.0])}, axis=-1, groups=2)
     {'b': Array([1., 3.], dtype=float32)}
@@ -420,7 +420,7 @@ def _converted(path: str, part: Array, leaf: Array, casting: str) -> Array:
 
 
 def _resize(target, source, axis, fill, groups, casting, where, *, larger):
-    """The part that target and source share, group by group; ``larger`` is the larger of them."""
+    """The part that target and source share, group by group; `larger` is the larger of them."""
     sources = flatten(source)
 
     def leaf_operation(path, leaf):

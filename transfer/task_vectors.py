@@ -1,7 +1,7 @@
 """Merging by task vectors: what training added to a common start, trimmed, chosen and added.
 
 The target is the *base* θ₀, each source a model θ_n trained from it, and τ_n = θ_n - θ₀ its task
-vector (Ilharco et al., 2023). For the rest see :mod:`transfer.merging`.
+vector (Ilharco et al., 2023). For the rest see `transfer.merging`.
 
 Axis letters: P population member, N source; n numbers in a leaf.
 """
@@ -26,7 +26,7 @@ def _kept(density: Array, vectors: Array) -> Array:
 
 
 def _largest(vectors: Array, counts: Array, *, skip: Array | int = 0) -> Array:
-    """Which numbers are among the ``counts`` largest of their source after the ``skip`` largest.
+    """Which numbers are among the `counts` largest of their source after the `skip` largest.
 
     bool [N, ...]; of equally large ones the first come first.
     """
@@ -65,16 +65,16 @@ def task_arithmetic(
     A negative weight unlearns a task.
 
     Args:
-        target: θ₀, the model that the sources were trained from.
-        sources: N models θ_n.
-        weights: w_n, a scalar or [N].
-        scale: λ, a scalar.
-        normalise: whether the sum is divided by Σ w_n, as mergekit's ``normalize``.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to merge.
+      target: θ₀, the model that the sources were trained from.
+      sources: N models θ_n.
+      weights: w_n, a scalar or [N].
+      scale: λ, a scalar.
+      normalise: whether the sum is divided by Σ w_n, as mergekit's `normalize`.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to merge.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`, or not one weight for each source.
+      ValueError: as `transfer.fraction`, or not one weight for each source.
 
     >>> models = [{"w": jnp.array([2.0, 1.0])}, {"w": jnp.array([1.0, 5.0])}]
     >>> task_arithmetic({"w": jnp.ones(2)}, models, weights=[1.0, 0.5])
@@ -115,17 +115,17 @@ def ties(
     each leaf, as mergekit does.
 
     Args:
-        target: θ₀, the model that the sources were trained from.
-        sources: N models θ_n.
-        density: share of each τ_n that is kept, in [0, 1]; a scalar or [N].
-        weights: w_n, a scalar or [N].
-        scale: λ, a scalar.
-        normalise: a mean, or with ``False`` the sum.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to merge.
+      target: θ₀, the model that the sources were trained from.
+      sources: N models θ_n.
+      density: share of each τ_n that is kept, in [0, 1]; a scalar or [N].
+      weights: w_n, a scalar or [N].
+      scale: λ, a scalar.
+      normalise: a mean, or with `False` the sum.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to merge.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`, or not one number for each source.
+      ValueError: as `transfer.fraction`, or not one number for each source.
 
     >>> base = {"w": jnp.zeros(3)}
     >>> models = [{"w": jnp.array([4.0, -3.0, 1.0])}, {"w": jnp.array([2.0, 5.0, 0.5])}]
@@ -167,24 +167,24 @@ def dare(
     """Drop and rescale (Yu et al., 2024, "Language Models are Super Mario", section 3.2).
 
     m ~ Bernoulli(density), number by number; τ̂_n = m ⊙ τ_n / density; then task arithmetic, or
-    with ``elect_sign`` the second and third step of :func:`ties` (mergekit's ``dare_linear`` and
-    ``dare_ties``). The draw of a leaf depends on the key and the leaf's path alone.
+    with `elect_sign` the second and third step of `ties` (mergekit's `dare_linear` and
+    `dare_ties`). The draw of a leaf depends on the key and the leaf's path alone.
 
     Args:
-        target: θ₀, the model that the sources were trained from.
-        sources: N models θ_n.
-        density: 1 - p of the paper, share of each τ_n that is kept on average, in [0, 1]; a scalar
-            or [N].
-        key: one key, or [P] for a population.
-        weights: w_n, a scalar or [N].
-        scale: λ, a scalar.
-        elect_sign: whether signs are elected as by TIES.
-        normalise: whether the sum is divided by the weights' sum.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to merge.
+      target: θ₀, the model that the sources were trained from.
+      sources: N models θ_n.
+      density: 1 - p of the paper, share of each τ_n that is kept on average, in [0, 1]; a scalar
+        or [N].
+      key: one key, or [P] for a population.
+      weights: w_n, a scalar or [N].
+      scale: λ, a scalar.
+      elect_sign: whether signs are elected as by TIES.
+      normalise: whether the sum is divided by the weights' sum.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to merge.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`, or not one number for each source.
+      ValueError: as `transfer.fraction`, or not one number for each source.
 
     >>> dare({"w": jnp.zeros(4)}, [{"w": jnp.ones(4)}], density=0.5, key=jax.random.key(4))
     {'w': Array([0., 2., 2., 0.], dtype=float32)}
@@ -231,19 +231,19 @@ def breadcrumbs(
     rest; θ₀ + λ Σ w_n τ̂_n.
 
     Args:
-        target: θ₀, the model that the sources were trained from.
-        sources: N models θ_n.
-        density: share of each τ_n that is kept, in [0, 1]; a scalar or [N].
-        outliers: share of the largest that is left out, mergekit's ``gamma``; a scalar or [N].
-        weights: w_n, a scalar or [N].
-        scale: λ, a scalar.
-        elect_sign: whether signs are elected as by TIES (mergekit's ``breadcrumbs_ties``).
-        normalise: whether the sum is divided by the weights' sum.
-        population: whether leaves are stacked on an axis P.
-        where: the leaves to merge.
+      target: θ₀, the model that the sources were trained from.
+      sources: N models θ_n.
+      density: share of each τ_n that is kept, in [0, 1]; a scalar or [N].
+      outliers: share of the largest that is left out, mergekit's `gamma`; a scalar or [N].
+      weights: w_n, a scalar or [N].
+      scale: λ, a scalar.
+      elect_sign: whether signs are elected as by TIES (mergekit's `breadcrumbs_ties`).
+      normalise: whether the sum is divided by the weights' sum.
+      population: whether leaves are stacked on an axis P.
+      where: the leaves to merge.
 
     Raises:
-        ValueError: as :func:`transfer.fraction`, or not one number for each source.
+      ValueError: as `transfer.fraction`, or not one number for each source.
 
     >>> breadcrumbs({"w": jnp.zeros(4)}, [{"w": jnp.array([9.0, 2.0, 1.0, 3.0])}],
     ...             density=0.5, outliers=0.25)

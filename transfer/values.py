@@ -26,17 +26,17 @@ def numbers(
     """The number that each chosen leaf gets, by path.
 
     Args:
-        name: what it is called in errors.
-        value: a scalar or an array, for all leaves; or one for each: a mapping
-            ``{path, branch or pattern: number}``, or a tree such as the target's own.
-        paths: those of the whole target; an entry that matches none of them is an error.
-        chosen: the leaves that need a number.
-        low: the least number allowed, ``None`` for any.
-        high: the greatest number allowed, ``None`` for any.
+      name: what it is called in errors.
+      value: a scalar or an array, for all leaves; or one for each: a mapping
+        `{path, branch or pattern: number}`, or a tree such as the target's own.
+      paths: those of the whole target; an entry that matches none of them is an error.
+      chosen: the leaves that need a number.
+      low: the least number allowed, `None` for any.
+      high: the greatest number allowed, `None` for any.
 
     Raises:
-        ValueError: a number out of range or not finite (where it is concrete), or that is none;
-            a leaf with no number, or with two.
+      ValueError: a number out of range or not finite (where it is concrete), or that is none;
+        a leaf with no number, or with two.
     """
     entries = _entries_of(value)
     if entries is None:
@@ -60,7 +60,7 @@ def numbers(
 
 
 def _entries_of(value: Any) -> dict[str, Any] | None:
-    """A tree or mapping of numbers as ``{path: number}``; ``None`` for one number or array."""
+    """A tree or mapping of numbers as `{path: number}`; `None` for one number or array."""
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         return None
     if jax.tree_util.all_leaves([value]):

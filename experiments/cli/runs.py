@@ -1,0 +1,324 @@
+"""Commands on one run: train, evaluate, classify, report. Their options, and what they do.
+
+What takes long to import is imported where it is used, so that bad input is told at once.
+"""
+
+import dataclasses
+import functools
+import inspect
+import typing
+from dataclasses import dataclass
+from dataclasses import fields as _fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from dreamer_jax.config import Config
+from experiments import methods
+from experiments.cli.exits import STOPPED, UsageError, usage_errors
+from experiments.cli.options import (
+    DEFAULT_PRESET,
+    Base,
+    ConfigFile,
+    Preset,
+    make_method,
+    method_defaults,
+    method_groups,
+    method_summary,
+    sequence,
+)
+from experiments.thesis.grid import SEEDS, Backend
+
+
+@dataclass(frozen=True)
+class Run:
+    """What to train, and where."""
+
+    task: tuple[str, ...]
+    """Names of the tasks, such as bullet/hopper (an unknown name lists them all), or gymnasium/ID
+    for any gymnasium environment with images, such as gymnasium/CartPole-v1."""
+    out: Path
+    """The results folder."""
+    seeds: tuple[int, ...] = (0,)
+    """One agent per seed; all train as one population."""
+    preset: Preset = DEFAULT_PRESET
+    """Settings to start from; each can be overridden by its name below."""
+    file: ConfigFile = None
+    """A YAML or JSON file of settings, written as a run's own are (run.json), or a part of them:
+    over the preset's, under those given by name."""
+    resume: bool = False
+    """Continue the run that the results folder holds."""
+    workers: int | None = None
+    """Simulator processes; by default one per core."""
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a population of agents, from scratch or from a source, or resume one.
+
+    Several tasks make one multi-task agent. With --source and --omega the population holds one
+    target per fraction and seed; other methods transfer in other ways.
+    """
+
+    run: Run
+    method: str | None
+    transfer: tuple[Any, ...]
+    config: Config
+
+
+@functools.cache
+def train_options() -> type:
+    """The options of `train`: a group for the run, one for the method, those of the settings of
+    methods, and those of the agent's settings."""
+    choices = Literal[tuple(methods.known())]  # type: ignore[valid-type]
+    named = Annotated[choices | None, tyro.conf.arg(help=method_summary())]
+    chooses = dataclasses.make_dataclass(
+        "transfer", [("method", named, dataclasses.field(default=None))], frozen=True
+    )
+    chooses.__doc__ = "How knowledge is transferred from a trained agent, if at all."
+    groups = {"run": Run, "transfer": chooses, **method_groups(), "config": Config}
+    fields = [(name, tyro.conf.OmitArgPrefixes[kind]) for name, kind in groups.items()]
+    found = dataclasses.make_dataclass("TrainOptions", fields, frozen=True)
+    found.__doc__ = inspect.getdoc(Train)
+    return found
+
+
+def train_defaults(base: Base) -> Any:
+    """Defaults of `train_options`, from a preset and perhaps a file of settings.
+
+    Raises:
+      ValueError: the file names a setting that no method has.
+    """
+    options, values = train_options(), base.values
+    kinds = {field.name: typing.get_type_hints(options)[field.name] for field in _fields(options)}
+    name, groups = method_defaults(values)
+    run = Run(
+        task=sequence(values, "tasks", tyro.MISSING),
+        out=tyro.MISSING,
+        seeds=sequence(values, "seeds", (0,)),
+        preset=base.preset,
+        file=base.file,
+    )
+    return options(run=run, transfer=kinds["transfer"](name), **groups, config=base.config)
+
+
+def train_command(options: Any) -> Train:
+    """The command that options of `train_options` make."""
+    groups = tuple(getattr(options, name) for name in method_groups())
+    return Train(options.run, options.transfer.method, groups, options.config)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play episodes with every agent of a results folder (the mode, without noise)."""
+
+    directory: tyro.conf.Positional[Path]
+    """The results folder."""
+    episodes: int = 5
+    """Episodes per agent and task."""
+    video: bool = False
+    """Write videos of an episode and of an open-loop prediction into the folder."""
+    workers: int | None = None
+    """Simulator processes; by default one per core."""
+
+
+@dataclass(frozen=True)
+class Classify:
+    """Tell the tasks of latent states, known ones from novel ones, as in Tables 13 to 15.
+
+    Plays episodes of each task, fits a classifier on an agent's latent states of the known tasks,
+    tests it on others, and draws them.
+    """
+
+    source: Path
+    """Results folder of the agent whose latent states are classified."""
+    task: tuple[str, ...]
+    """Names of all tasks."""
+    known: tuple[str, ...]
+    """Those of the tasks that the classifier is fitted on; the others are novel."""
+    out: Path | None = None
+    """Folder for the table and the picture; by default classification/ in the source's."""
+    source_member: int = 0
+    """Which member of the source's population."""
+    samples: int = 100
+    """Latent states of each task to fit on, and as many, of other episodes, to test."""
+    thresholds: tuple[float, ...] = ()
+    """Distances beyond which a state is novel; by default 50, 70 and 90 for 230 features, scaled
+    to the agent's. One suggested by the fitted samples is always added."""
+    quantile: float = 0.95
+    """Share of known samples that the suggested threshold should hold."""
+    neighbours: int = 5
+    """Nearest samples that vote for the task."""
+    policy: Literal["random", "trained"] = "random"
+    """Who plays: random actions, or a trained agent (the mode, without noise)."""
+    actors: tuple[Path, ...] = ()
+    """With --policy trained: results folders of the agents that play, one for each task; by
+    default the source's agent plays all."""
+    features: Literal["sample", "mean", "first"] = "sample"
+    """The latent state: a sample of the posterior along an episode (what agents act on), its mean,
+    or each image as if it were the first of an episode."""
+    seed: int = 0
+    """Of episodes, actions and samples."""
+    workers: int | None = None
+    """Simulator processes; by default one per core."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Print the table of a results folder and draw its learning curves.
+
+    Of several folders: of all of them beside each other. Of a folder of all results of a preset
+    (results/cpu): write all tables, figures and the page.
+    """
+
+    directories: tyro.conf.Positional[tuple[Path, ...]]
+    """The results folder, or several."""
+    out: Path = Path("comparison.png")
+    """Of several folders: the picture to draw; an .svg is written beside it."""
+    seeds: tuple[int, ...] = SEEDS
+    """Of all results: the seeds that tables and figures show."""
+    backend: Backend = "bullet"
+    """Of all results: the simulators."""
+
+
+def train(command: Train) -> int:
+    """Trains a population."""
+    from experiments.runs.spec import RunSpec
+
+    run = command.run
+    with usage_errors():
+        method = make_method(command.method, command.transfer)
+        spec = RunSpec(run.task, run.seeds, command.config, method)
+    from experiments.runs.run import carry_out, make_run
+
+    with usage_errors():
+        begun = make_run(spec, run.out, resume=run.resume, workers=run.workers)
+    if spec.method.needs:
+        print((run.out / "transfer.txt").read_text())
+    if carry_out(begun) == "stopped":
+        print(f"stopped and saved in {run.out}: the same command with --resume continues")
+        return STOPPED
+    return report(Report((run.out,)))
+
+
+def report(command: Report) -> int:
+    """Shows a run, several beside each other, or all results under a folder."""
+    from experiments.cli.thesis import report_all
+    from experiments.reports import summary
+    from experiments.runs.folder import run_folders
+
+    if not command.directories:
+        raise UsageError("nothing to report: name a results folder, or several")
+    if len(command.directories) > 1:
+        with usage_errors():
+            print(summary.table(summary.compare(command.directories)))
+            picture, _ = summary.plot_comparison(command.directories, command.out)
+        print(f"learning curves: {picture}")
+        return 0
+    (directory,) = command.directories
+    if not (directory / "run.json").exists() and run_folders(directory):
+        return report_all(directory, command.seeds, command.backend)
+    with usage_errors():
+        summaries = summary.summarise(directory)
+    print(summary.table(summaries))
+    if summary.evaluations(directory):
+        picture, _ = summary.plot_curves(directory)
+        print(f"learning curves: {picture}")
+    return 0
+
+
+def evaluate(command: Evaluate) -> int:
+    """Plays episodes and prints their returns."""
+    import numpy as np
+    from rich.progress import Progress
+
+    from dreamer_jax.files import write_json_atomically
+    from experiments.runs.evaluate import evaluate, load_agents
+    from experiments.runs.text import aligned
+
+    if command.episodes < 1:
+        raise UsageError(f"--episodes is {command.episodes}, must be at least 1")
+    with usage_errors():
+        agents = load_agents(command.directory)
+    with Progress() as bar:
+        job = bar.add_task("evaluating", total=command.episodes)
+        rows = evaluate(
+            agents,
+            command.episodes,
+            video=command.video,
+            workers=command.workers,
+            report=lambda done, score: bar.update(
+                job, completed=done, description=f"evaluating, return {score:.0f}"
+            ),
+        )
+    groups: dict[tuple, list] = {}
+    for row in rows:
+        groups.setdefault((row["label"], row["seed"], row["task"]), []).append(row)
+    lines = []
+    for (label, seed, task), chosen in groups.items():
+        returns = [row["return"] for row in chosen]
+        length = np.mean([row["length"] for row in chosen])
+        lines.append(
+            [
+                f"{label}, seed {seed}, {task}",
+                f"{np.mean(returns):.1f} ± {np.std(returns):.1f}",
+                f"{min(returns):.1f}",
+                f"{max(returns):.1f}",
+                f"{length:.0f}",
+            ]
+        )
+    print(aligned(["agent", "return", "lowest", "highest", "length"], lines))
+    write_json_atomically(command.directory / "evaluation.json", {"episodes": rows})
+    print(f"episodes: {command.directory / 'evaluation.json'}")
+    if command.video:
+        videos = command.directory / "videos"
+        for path in sorted([*videos.glob("evaluate_*.mp4"), *videos.glob("prediction_*.mp4")]):
+            print(f"video: {path}")
+    return 0
+
+
+def classify(command: Classify) -> int:
+    """Tells the tasks of latent states."""
+    from rich.progress import Progress
+
+    from dreamer_jax.files import write_json_atomically
+    from experiments.runs import classify
+    from experiments.runs.agents import load_source
+
+    request = {
+        "samples": command.samples,
+        "neighbours": command.neighbours,
+        "quantile": command.quantile,
+        "policy": command.policy,
+    }
+    with usage_errors():
+        classify.check_request(command.task, command.known, actors=command.actors, **request)
+        source = load_source(command.source, command.source_member)
+        actors = [load_source(directory) for directory in command.actors]
+        with Progress() as bar:
+            total = classify.rounds(source, command.samples) * max(1, len(actors))
+            job = bar.add_task("gathering samples", total=total)
+            outcome = classify.classify(
+                source,
+                command.task,
+                command.known,
+                thresholds=command.thresholds,
+                features=command.features,
+                actors=actors,
+                seed=command.seed,
+                workers=command.workers,
+                report=lambda: bar.advance(job),
+                **request,
+            )
+    folder = command.source / "classification" if command.out is None else command.out
+    folder.mkdir(parents=True, exist_ok=True)
+    print("Novel tasks: share taken for novel. Known: taken for not novel / for the right task.\n")
+    print(classify.table(outcome) + "\n\n" + classify.distance_table(outcome) + "\n")
+    settings = {"source": str(command.source), "features": command.features, **request}
+    write_json_atomically(
+        folder / "classification.json", {"settings": settings, **classify.to_dict(outcome)}
+    )
+    for path in (folder / "classification.json", *classify.plot(outcome, folder / "latents")):
+        print(f"wrote {path}")
+    return 0

@@ -1,0 +1,365 @@
+"""Commands on the thesis's grid: table, figure, plan, demo. Their options, and what they do.
+
+What takes long to import is imported where it is used, so that bad input is told at once.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dreamer_jax import config as configs
+from experiments.cli.exits import FAILURE, STOPPED, usage_errors
+from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
+from experiments.thesis import grid
+from experiments.thesis.grid import Backend, Figure, Table
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What all runs of a sweep share."""
+
+    preset: Preset = DEFAULT_PRESET
+    """Settings of all agents, each of which can be overridden by its name below; results are in a
+    folder of that name."""
+    seeds: tuple[int, ...] = grid.SEEDS
+    """Seeds of targets and baselines; source agents have the first of them."""
+    backend: Backend = "bullet"
+    """The simulators."""
+    omegas: tuple[float, ...] = grid.OMEGAS
+    """Train targets of these fractions only; what is left out is shown as not run."""
+    counts: tuple[int, ...] = grid.COUNTS
+    """Train targets of these numbers of source tasks only."""
+    results: Path = Path("results")
+    """The folder of all results."""
+    workers: int | None = None
+    """Simulator processes; by default one per core."""
+    file: ConfigFile = None
+    """A YAML or JSON file of settings (config, and perhaps seeds), written as a run's own are
+    (run.json): over the preset's, under those given by name."""
+    config: tyro.conf.OmitArgPrefixes[configs.Config] = configs.preset("cpu")
+
+    @property
+    def root(self) -> Path:
+        """The folder of the results of this preset."""
+        return self.results / self.preset
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Make tables of the thesis: train what is missing of their agents, show them beside it.
+
+    What is done is not repeated, what was cut goes on, and agents are shared by all tables and
+    figures. Ctrl-C saves and stops; the same command goes on.
+    """
+
+    names: tyro.conf.Positional[tuple[str, ...]]
+    """Numbers of tables (1 to 17), or all."""
+    sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Make figures of the thesis, as `table` makes tables."""
+
+    names: tyro.conf.Positional[tuple[str, ...]]
+    """Numbers of figures (10 to 39), or all."""
+    sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Show the runs that tables and figures need, and what they will take, without running them.
+
+    Time, memory and disk are estimates, from a short measurement on this machine: half a minute
+    for each simulator and one for updates, most of it compilation.
+    """
+
+    table: tuple[str, ...] = ()
+    """Numbers of tables (1 to 17), or all."""
+    figure: tuple[str, ...] = ()
+    """Numbers of figures (10 to 39), or all."""
+    sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The main job in minutes: a part of Table 7, with a source of two tasks and two seeds."""
+
+    results: Path = Path("results")
+    """The folder of all results; the demo's are in one of its preset's name."""
+    preset: Literal["demo", "debug"] = "demo"
+    """debug runs the same in seconds."""
+    workers: int | None = None
+    """Simulator processes; by default one per core."""
+
+
+def _sweep(base: Base) -> Sweep:
+    """The defaults of a sweep."""
+    if strange := sorted(set(base.values) - {"preset", "seeds", "config"}):
+        raise ValueError(f"{base.file}: the settings {', '.join(strange)} are those of a table")
+    seeds = sequence(base.values, "seeds", grid.SEEDS)
+    return Sweep(preset=base.preset, file=base.file, seeds=seeds, config=base.config)
+
+
+def table_defaults(base: Base) -> Tables:
+    """Defaults of `table`."""
+    return Tables(names=tyro.MISSING, sweep=_sweep(base))
+
+
+def figure_defaults(base: Base) -> Figures:
+    """Defaults of `figure`."""
+    return Figures(names=tyro.MISSING, sweep=_sweep(base))
+
+
+def plan_defaults(base: Base) -> Plan:
+    """Defaults of `plan`."""
+    return Plan(sweep=_sweep(base))
+
+
+def chosen(
+    entries: Mapping[str, Table | Figure], names: Sequence[str], backend: Backend
+) -> list[Table | Figure]:
+    """The tables or figures of the given numbers, on a backend.
+
+    Raises:
+      ValueError: there is no such table or figure; names those there are.
+    """
+    found: dict[str, None] = {}
+    kind = next(iter(entries)).partition("-")[0]
+    numbers = [name.partition("-")[2] for name in entries]
+    if not names:
+        raise ValueError(f"no {kind} named: choose from {numbers[0]} to {numbers[-1]}, or all")
+    for name in names:
+        if name == "all":
+            found |= dict.fromkeys(entries)
+        elif f"{kind}-{name}" in entries:
+            found.setdefault(f"{kind}-{name}")
+        else:
+            raise ValueError(
+                f"unknown {kind} {name!r}: choose from {numbers[0]} to {numbers[-1]}, or all"
+            )
+    return [grid.on_backend(entries[name], backend) for name in found]
+
+
+def tables(command: Tables) -> int:
+    """Makes tables."""
+    with usage_errors():
+        entries = chosen(grid.TABLES, command.names, command.sweep.backend)
+    return _make(entries, command.sweep)
+
+
+def figures(command: Figures) -> int:
+    """Makes figures."""
+    with usage_errors():
+        entries = chosen(grid.FIGURES, command.names, command.sweep.backend)
+    return _make(entries, command.sweep)
+
+
+def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
+    """A table or figure of the fractions and numbers of source tasks that are asked for."""
+    omegas = tuple(omega for omega in entry.omegas if omega in sweep.omegas)
+    counts = tuple(count for count in entry.counts if count in sweep.counts)
+    return dataclasses.replace(entry, omegas=omegas, counts=counts)
+
+
+def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
+    """The runs behind tables and figures."""
+    from experiments.thesis.graph import plan_runs
+
+    with usage_errors():
+        if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
+            raise ValueError(f"seeds {sweep.seeds} must be one or more, each named once")
+        for name, wanted, there in (
+            ("omegas", sweep.omegas, grid.OMEGAS),
+            ("counts", sweep.counts, grid.COUNTS),
+        ):
+            if not wanted or not set(wanted) <= set(there):
+                raise ValueError(f"{name} {wanted} must be one or more of {there}")
+        entries = [_restricted(entry, sweep) for entry in entries]
+        cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
+        return plan_runs(cells, sweep.config, sweep.root)
+
+
+def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
+    """Trains what is missing of tables and figures.
+
+    Returns:
+      The runs behind them, and what became of these.
+
+    Raises:
+      UsageError: results of other settings are there, or a simulator is not installed.
+    """
+    from experiments.thesis.sweep import carry_out_runs
+
+    runs = _planned(entries, sweep)
+    with usage_errors():
+        progress = carry_out_runs(runs, sweep.root, workers=sweep.workers)
+    if progress.stopped:
+        print(f"stopped and saved in {sweep.root}: the same command goes on")
+    return runs, progress
+
+
+def _tell_problems(progress) -> int:
+    """Names what was not trained.
+
+    Returns:
+      The exit code.
+    """
+    for kind, names in (("failed", progress.failed), ("skipped", progress.skipped)):
+        for name, reason in names.items():
+            print(f"{kind}: {name}: {reason}", file=sys.stderr)
+    return 0 if progress.complete else FAILURE
+
+
+def plan(command: Plan) -> int:
+    """Shows the graph with an estimate."""
+    from experiments.thesis import estimate
+
+    sweep = command.sweep
+    with usage_errors():
+        if not (command.table or command.figure):
+            raise ValueError("nothing to plan: add --table 3, or --figure 12, or all of them")
+        entries = [
+            *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
+            *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
+        ]
+    runs = _planned(entries, sweep)
+    due = [run for run in runs if run.state in ("missing", "cut")]
+    speed = None
+    if due:
+        print("measuring how fast this machine is:", file=sys.stderr)
+        speed = estimate.measure(
+            (run.spec for run in due), lambda what: print(f"  {what}", file=sys.stderr, flush=True)
+        )
+    print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
+    print(estimate.plan_table(runs, speed))
+    if speed is not None:
+        print(
+            f"\nAn estimate, from {speed.update_seconds:.3g} s for an update of one agent and "
+            f"{1000 * max(speed.tick_seconds.values()):.1f} ms for a tick of\nthe slowest "
+            "simulator here and now. Runs come one after another; each is compiled first."
+        )
+    return 0
+
+
+def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
+    """Trains what is missing and writes tables and figures."""
+    from rich.progress import Progress
+
+    from experiments.thesis.latent_tables import make_table
+
+    runs, progress = _carry_out(entries, sweep)
+    if progress.stopped:
+        return STOPPED
+    run_of = {cell: run.name for run in runs for cell in run.cells}
+    for entry in entries:
+        if entry.kind != "ltc":
+            continue
+        (cell,) = grid.shown(entry, sweep.seeds)
+        if (name := run_of[cell.name]) in progress.failed | progress.skipped:
+            progress.skipped[entry.name] = f"it needs {name}"
+            continue
+        try:
+            with Progress() as bar:
+                job = bar.add_task("gathering", visible=False)
+                make_table(
+                    sweep.root,
+                    entry,
+                    sweep.seeds[0],
+                    workers=sweep.workers,
+                    report=lambda done, rounds, bar=bar, job=job: bar.update(
+                        job, completed=done, total=rounds, visible=True
+                    ),
+                )
+        except ValueError as error:
+            progress.failed[entry.name] = str(error)
+    _write(entries, sweep.root, sweep.seeds, sweep.backend)
+    return _tell_problems(progress)
+
+
+def _write(
+    entries: Sequence[Table | Figure], root: Path, seeds: tuple[int, ...], backend: Backend
+) -> None:
+    """Writes tables, figures, and the page of all results under a root."""
+    from experiments.reports import page, publication
+    from experiments.runs.folder import report_folder
+
+    folder = report_folder(root, backend)
+    folder.mkdir(parents=True, exist_ok=True)
+    for entry in entries:
+        if isinstance(entry, Table):
+            print(publication.write_table(entry, root, seeds, folder) + "\n")
+            print(f"wrote {folder / entry.name}.txt, .csv, .png and .svg\n")
+        else:
+            for path in publication.write_figure(entry, root, seeds, folder):
+                print(f"wrote {path}")
+    print(f"wrote {page.write_page(root, seeds, backend, folder / 'index.html')}")
+
+
+def report_all(root: Path, seeds: tuple[int, ...], backend: Backend) -> int:
+    """Writes all tables and figures of which there is something, and the page. Trains nothing."""
+    from experiments.reports.outcomes import read_classification
+    from experiments.runs.folder import folders
+
+    held = folders(root)
+    entries = []
+    for entry in (*grid.TABLES.values(), *grid.FIGURES.values()):
+        entry = grid.on_backend(entry, backend)
+        if entry.kind == "ltc":
+            there = read_classification(root, entry, seeds) is not None
+        else:
+            there = any(cell.name in held for cell in grid.shown(entry, seeds))
+        if there:
+            entries.append(entry)
+    _write(entries, root, seeds, backend)
+    return 0
+
+
+def demo(command: Demo) -> int:
+    """Runs the grid's entry of that name and shows what came of it."""
+    from experiments.reports import summary
+    from experiments.runs import evaluate
+    from experiments.runs.folder import folders
+
+    sweep = Sweep(
+        command.preset,
+        seeds=(0, 1),
+        results=command.results,
+        workers=command.workers,
+        config=configs.preset(command.preset),
+    )
+    _, progress = _carry_out([grid.DEMO], sweep)
+    if not progress.complete:
+        return STOPPED if progress.stopped else _tell_problems(progress)
+    places = folders(sweep.root)
+    for folder in dict.fromkeys(places[cell.name][0] for cell in grid.shown(grid.DEMO, (0, 1))):
+        evaluate.evaluate(evaluate.load_agents(folder), 1, video=True, workers=sweep.workers)
+        pictures = summary.plot_curves(folder)
+        if (folder / "transfer.txt").exists():
+            print("\nWhat was transferred, leaf by leaf (norms are means over the targets)\n")
+            print((folder / "transfer.txt").read_text())
+        title = grid.DEMO.targets[0]
+        print(f"Return of evaluation episodes on {title}, mean ± standard deviation\n")
+        print(summary.table(summary.summarise(folder)))
+        for path in (*pictures, *sorted((folder / "videos").glob("*.mp4"))):
+            print(f"wrote {path}")
+    print("\n" + _scale(configs.preset(command.preset)))
+    return 0
+
+
+def _scale(config: configs.Config) -> str:
+    """A plain word on what runs of this size can show."""
+    from dreamer_jax.schedule import Schedule
+
+    schedule = Schedule(config.schedule, tasks=1)
+    return (
+        "This demo shows the machinery, not the effect. Its agents are small, and a target makes "
+        f"{schedule.updates:,} updates\non {schedule.environment_steps(schedule.rounds):,} "
+        "environment steps, where one of the thesis makes about 100,000 on 1,000,000. None has "
+        "learned its task:\nthe differences between the rows above are noise."
+    )

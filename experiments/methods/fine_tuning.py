@@ -1,0 +1,43 @@
+"""Fine-tuning: everything copied where shapes fit, and trained on. The plainest transfer."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import ClassVar
+
+from experiments.methods.targets import Targets
+
+# What is of the actions' size, in every agent.
+_OF_ACTIONS = ("dynamics/action_in/*", "actor/out/*")
+
+
+@dataclass(frozen=True)
+class FineTuning(Targets):
+    """One target per source and seed, which begins as its source."""
+
+    NAME: ClassVar[str] = "fine-tuning"
+    SUMMARY: ClassVar[str] = "everything copied where shapes fit, and trained on"
+
+    def plan(self, unfit: Collection[str] = _OF_ACTIONS):
+        """Copies all but what does not fit.
+
+        Args:
+          unfit: patterns of the leaves that the sources have in another shape, or not at all.
+        """
+        from transfer import Plan, Rule
+
+        others = tuple(f"!{path}" for path in unfit)
+        rules = [Rule(("**", *others), "copy", note="as in the source")]
+        if unfit:
+            rules.append(Rule(tuple(unfit), "keep", note="random: another shape in the source"))
+        return Plan(name=self.NAME, rules=tuple(rules))
+
+    def knowledge(self, agent, seeds, sources, sample):
+        """Each target's source, as far as it fits."""
+        import jax
+
+        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
+        plan = self.plan(self.unfit(fresh, sources))
+        return self.from_sources(plan, seeds, sources, fresh)
+
+
+METHOD = FineTuning

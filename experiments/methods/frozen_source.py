@@ -1,0 +1,54 @@
+"""A frozen source: its encoder, decoder and dynamics stay as they are, and heads are trained."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import ClassVar
+
+from experiments.methods.targets import Targets
+
+_FROZEN = ("encoder/**", "decoder/**", "dynamics/**", "!dynamics/action_in/*")
+_TRAINED = ("dynamics/action_in/*", "reward/**", "value/**", "actor/**")
+_OPTIONAL = ("termination/**",)
+
+
+@dataclass(frozen=True)
+class FrozenSource(Targets):
+    """One target per source and seed, of whose world model only the heads are trained.
+
+    The kernel of the action trains, too: its size and meaning change with the task.
+    """
+
+    NAME: ClassVar[str] = "frozen-source"
+    SUMMARY: ClassVar[str] = "everything copied where shapes fit, all but the heads frozen"
+
+    def plan(self, unfit: Collection[str] = ("dynamics/action_in/*", "actor/out/*")):
+        """Copies all but what does not fit, and freezes what is no head.
+
+        Args:
+          unfit: patterns of the leaves that the sources have in another shape, or not at all.
+        """
+        from transfer import Plan, Rule
+
+        others = tuple(f"!{path}" for path in unfit)
+        rules = [
+            Rule(_FROZEN, "copy", frozen=True, note="as in the source"),
+            Rule((*_TRAINED, *others), "copy", note="trains on"),
+        ]
+        rules += [
+            Rule((pattern, *others), "copy", optional=True, note="trains on")
+            for pattern in _OPTIONAL
+        ]
+        if unfit:
+            rules.append(Rule(tuple(unfit), "keep", note="random: another shape in the source"))
+        return Plan(name=self.NAME, rules=tuple(rules))
+
+    def knowledge(self, agent, seeds, sources, sample):
+        """Each target's source, as far as it fits."""
+        import jax
+
+        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
+        plan = self.plan(self.unfit(fresh, sources))
+        return self.from_sources(plan, seeds, sources, fresh)
+
+
+METHOD = FrozenSource

@@ -1,0 +1,1 @@
+"""Networks that methods add to an agent."""

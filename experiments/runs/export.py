@@ -1,0 +1,107 @@
+"""A member of a run -> an exported agent: weights and a card, see `experiments.runs.exported`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import transfer
+from dreamer_jax.checkpoint import Checkpointer
+from dreamer_jax.files import read_json, write_json_atomically
+from dreamer_jax.logs import read_metrics
+from dreamer_jax.schedule import Schedule
+from experiments.runs.agents import load_params
+from experiments.runs.evaluate import evaluate, load_agents
+from experiments.runs.exported import FORMAT, SUFFIX, Card, file_sha256
+from experiments.runs.spec import read_spec
+
+
+def export(
+    directory: str | Path,
+    path: str | Path,
+    *,
+    member: int = 0,
+    episodes: int = 10,
+    note: str = "",
+    workers: int | None = None,
+    report: Callable[[int, float], Any] = lambda done, score: None,
+) -> Card:
+    """Writes one member of a run as weights and a card, after playing episodes with it.
+
+    Args:
+      directory: the results folder; its newest checkpoint is exported.
+      path: the file of weights to write, ending in .safetensors.
+      member: which of the population.
+      episodes: to play of each task, for the card.
+      note: a sentence for the card.
+      workers: simulator processes; by default one per core.
+      report: called after each episode with how many are done and their mean return.
+
+    Raises:
+      ValueError: the path ends otherwise; the folder holds no run, no checkpoint, no such member,
+        or parameters that are not finite.
+      FileExistsError: there is such a file already.
+    """
+    directory, path = Path(directory), Path(path)
+    if path.suffix != SUFFIX:
+        raise ValueError(f"weights are written as {SUFFIX}, and {path} ends otherwise")
+    for there in (path, path.with_suffix(".json")):
+        if there.exists():
+            raise FileExistsError(f"{there} is there already: choose another name, or remove it")
+    if episodes < 1:
+        raise ValueError(f"a card needs episodes: {episodes} were asked for, must be at least 1")
+    spec = read_spec(directory)
+    members = spec.members
+    if not 0 <= member < len(members):
+        raise ValueError(
+            f"{directory} has members 0 to {len(members) - 1}, member {member} was asked for"
+        )
+    params = jax.tree.map(lambda leaf: leaf[member], load_params(directory))
+    for name, leaf in transfer.flatten(params).items():
+        if not np.all(np.isfinite(leaf)):
+            raise ValueError(f"{name} of member {member} of {directory} is not finite")
+    returns = _play(directory, member, episodes, workers=workers, report=report)
+    counters = Checkpointer(directory / "checkpoints").metadata()["counters"]
+    schedule = Schedule(spec.config.schedule, len(spec.tasks))
+    steps = schedule.environment_steps(counters["rounds"])
+    header = read_json(directory / "run.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    transfer.save(path, params)
+    card = Card(
+        spec=spec,
+        seed=members[member].seed,
+        label=members[member].label,
+        environment_steps=steps,
+        updates=counters["updates"],
+        curves=_curves(directory, member, steps),
+        returns=returns,
+        revision=header.get("revision", "unknown"),
+        versions=header.get("versions", {}),
+        sha256=file_sha256(path),
+        note=note,
+    )
+    values = {**vars(card), "spec": spec.to_dict(), "format": FORMAT}
+    write_json_atomically(path.with_suffix(".json"), values)
+    return card
+
+
+def _play(directory, member: int, episodes: int, *, workers, report) -> dict[str, tuple]:
+    """Returns of episodes of one member, by name of the task."""
+    rows = evaluate(load_agents(directory), episodes, workers=workers, report=report)
+    returns: dict[str, tuple[float, ...]] = {}
+    for row in rows:
+        if row["member"] == member:
+            returns[row["task"]] = (*returns.get(row["task"], ()), round(row["return"], 2))
+    return returns
+
+
+def _curves(directory: Path, member: int, steps: int) -> dict[str, tuple]:
+    """Evaluation returns of one member up to a number of environment steps, by name of the task."""
+    curves: dict[str, tuple[tuple[int, float], ...]] = {}
+    for row in read_metrics(directory / "metrics.jsonl"):
+        if (row["kind"], row["member"]) == ("evaluation", member) and row["env_steps"] <= steps:
+            point = (row["env_steps"], round(row["return"], 2))
+            curves[row["task"]] = (*curves.get(row["task"], ()), point)
+    return curves

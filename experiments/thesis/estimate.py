@@ -1,0 +1,311 @@
+"""What runs will take: time, memory and disk, from a short measurement on this machine.
+
+An estimate: it takes one member's update and one simulator's tick, and multiplies. Members that
+are mapped at once on an accelerator take less time than that, and a busy machine more.
+
+Axis letters: P population member, K task, T ticks in a phase, A action.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.config import Config
+from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.schedule import Schedule
+from envs.pool import available_cores
+from experiments.runs.agents import make_agent
+from experiments.runs.spec import RunSpec, action_size
+from experiments.runs.text import aligned
+from experiments.thesis.graph import PlannedRun
+
+UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What was measured.
+
+    Attributes:
+      update_seconds: one update of one member.
+      update_bytes: memory that it takes beside the member's state and batch.
+      policy_seconds: choosing one action for one member.
+      tick_seconds: one tick of one simulator, by name of task.
+      compile_seconds: until an update and a policy are compiled.
+      tick_compile_seconds: until a tick of a simulator is, by name of task; physics that is part
+        of the program takes long.
+      workers: simulator processes that work at once.
+    """
+
+    update_seconds: float
+    update_bytes: int
+    policy_seconds: float
+    tick_seconds: Mapping[str, float]
+    compile_seconds: float
+    tick_compile_seconds: Mapping[str, float]
+    workers: int
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one run still takes.
+
+    Attributes:
+      seconds: to its end.
+      memory: bytes, at most.
+      disk: bytes, in the end.
+    """
+
+    seconds: float
+    memory: int
+    disk: int
+
+
+def _batch(agent: Agent, members: int) -> Batch:
+    """Records of the sizes of a batch, leaves [P, B, L, ...]."""
+    learning, size = agent.config.learning, agent.config.network.image_size
+    shape = (members, learning.batch_size, learning.sequence_length)
+    random = np.random.default_rng(0)
+    return Batch(
+        image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
+        action=np.zeros((*shape, agent.action_size), np.float32),
+        reward=np.zeros(shape, np.float32),
+        first=np.zeros(shape, bool),
+        terminal=np.zeros(shape, bool),
+    )
+
+
+@functools.cache
+def _compiled_update(agent: Agent):
+    """One member's update, compiled, with what it is called on."""
+    learning = agent.config.learning
+    state = init_members(agent, jnp.zeros(1, jnp.int32))
+    sums = zero_sums(agent, state, learning.batch_size, learning.sequence_length)
+    batch = _batch(agent, 1)
+    lowered = update_members.lower(agent, state, sums, batch, mapping="auto", chunk=1)
+    return lowered.compile(), state, sums, batch
+
+
+def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what: None) -> Speed:
+    """Measures the updates and the simulators of runs of one preset.
+
+    A plain agent of the largest action size stands for all of them. Nearly all of the time goes to
+    compilation, half a minute or so for each thing to be measured.
+
+    Args:
+      specs: the runs.
+      tell: is told what is measured next.
+    """
+    specs = tuple(specs)
+    tasks = tuple(dict.fromkeys(task for spec in specs for task in spec.tasks))
+    things = len(tasks) + 1
+    widest = max(tasks, key=lambda task: envs.spec(task).action_size)
+    agent = make_agent(RunSpec((widest,), (0,), specs[0].config))
+    tell(f"[1/{things}] an update and a policy")
+    started = time.perf_counter()
+    update, state, sums, batch = _compiled_update(agent)
+    policy_seconds = _policy_seconds(agent, state.params)
+    compile_seconds = time.perf_counter() - started
+    update_bytes = update.memory_analysis().temp_size_in_bytes
+    # The state is donated: a copy of it is.
+    state = jax.tree.map(jnp.copy, state)
+    state, sums, loss = update(state, jax.tree.map(jnp.copy, sums), batch)
+    loss.block_until_ready()
+    updates, started = 0, time.perf_counter()
+    while time.perf_counter() - started < UPDATE_SECONDS:
+        state, sums, loss = update(state, sums, batch)
+        loss.block_until_ready()
+        updates += 1
+    update_seconds = (time.perf_counter() - started) / updates
+    ticks = {}
+    for number, task in enumerate(tasks, start=2):
+        tell(f"[{number}/{things}] {task}")
+        ticks[task] = _tick_seconds(task, agent.config)
+    return Speed(
+        update_seconds=update_seconds,
+        update_bytes=update_bytes,
+        policy_seconds=policy_seconds,
+        tick_seconds={task: each for task, (each, _) in ticks.items()},
+        compile_seconds=compile_seconds,
+        tick_compile_seconds={task: first for task, (_, first) in ticks.items()},
+        workers=available_cores(),
+    )
+
+
+def _policy_seconds(agent: Agent, params) -> float:
+    """Seconds for the choice of one action."""
+    size = agent.config.network.image_size
+    image = jnp.zeros((size, size, 3), jnp.uint8)
+
+    @jax.jit
+    def act(params):
+        def tick(carry, key):
+            action, carry = agent.policy(params, carry, image, jnp.bool_(False), key, "explore")
+            return carry, action
+
+        keys = jax.random.split(jax.random.key(0), TICKS)
+        return jax.lax.scan(tick, agent.initial_carry(), keys)[1]
+
+    one = jax.tree.map(lambda x: x[0], params)
+    act(one).block_until_ready()
+    started = time.perf_counter()
+    act(one).block_until_ready()
+    return (time.perf_counter() - started) / TICKS
+
+
+def _tick_seconds(task: str, config: Config) -> tuple[float, float]:
+    """Seconds for a tick of one simulator, what carries it to jitted code included, and seconds
+    until the first."""
+    env = envs.make(
+        [task],
+        image_size=config.network.image_size,
+        action_repeat=config.schedule.action_repeat,
+        workers=1,
+        supersample=config.schedule.supersample,
+    )
+    try:
+        made = time.perf_counter()
+        state, _ = jax.jit(jax.vmap(env.reset))(
+            jnp.arange(1), jax.random.split(jax.random.key(0), 1)
+        )
+
+        @jax.jit
+        def play(state, key):
+            actions = jax.random.uniform(key, (TICKS, 1, env.action_size), minval=-1.0)
+            return jax.lax.scan(jax.vmap(env.step), state, actions)
+
+        state, _ = jax.block_until_ready(play(state, jax.random.key(1)))
+        first_seconds = time.perf_counter() - made
+        started = time.perf_counter()
+        jax.block_until_ready(play(state, jax.random.key(2)))
+        seconds = time.perf_counter() - started
+        env.check()
+        return seconds / TICKS, first_seconds
+    finally:
+        env.close()
+
+
+def _bytes(tree) -> int:
+    return sum(
+        int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in jax.tree.leaves(tree)
+    )
+
+
+@functools.cache
+def _member_bytes(agent: Agent) -> int:
+    """Parameters and both moments of Adam of one member."""
+    return _bytes(jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32)))
+
+
+def _record_bytes(spec: RunSpec) -> int:
+    """Image, action, reward and two flags."""
+    size = spec.config.network.image_size
+    return 3 * size * size + 4 * action_size(spec.tasks) + 4 + 2
+
+
+def _memory(spec: RunSpec, update_bytes: int, chunk: int) -> int:
+    """Bytes: states, two batches, one phase of records twice, and the updates of one chunk."""
+    learning, schedule = spec.config.learning, spec.config.schedule
+    records = learning.batch_size * learning.sequence_length
+    records += (schedule.phase_ticks + 1) * len(spec.tasks)
+    each = _member_bytes(make_agent(spec)) + 2 * records * _record_bytes(spec)
+    return len(spec.members) * each + chunk * update_bytes
+
+
+def _chunk(spec: RunSpec) -> int:
+    """How many members an update maps at once."""
+    schedule = spec.config.schedule
+    one_by_one = schedule.mapping == "auto" and jax.default_backend() == "cpu"
+    if schedule.mapping == "chunks" or one_by_one:
+        return min(schedule.mapping_chunk, len(spec.members))
+    return len(spec.members)
+
+
+def estimate(run: PlannedRun, speed: Speed) -> Estimate:
+    """What a run that is missing or was cut still takes."""
+    spec = run.spec
+    members, tasks, schedule = len(spec.members), len(spec.tasks), spec.config.schedule
+    whole = Schedule(schedule, tasks)
+    ticks = (whole.rounds + whole.evaluations) * schedule.phase_ticks
+    slots = members * tasks
+    simulated = sum(speed.tick_seconds[task] for task in spec.tasks) * members
+    tick = slots * speed.policy_seconds + simulated / min(speed.workers, slots)
+    left = 1 - run.progress
+    seconds = left * (whole.updates * members * speed.update_seconds + ticks * tick)
+    records = whole.rounds * (schedule.phase_ticks + 1)
+    if schedule.replay_keep is not None:
+        records = min(records, schedule.replay_keep)
+    disk = slots * records * _record_bytes(spec)
+    disk += CHECKPOINTS * members * _member_bytes(make_agent(spec))
+    memory = _memory(spec, speed.update_bytes, _chunk(spec))
+    seconds += speed.compile_seconds + sum(speed.tick_compile_seconds[task] for task in spec.tasks)
+    return Estimate(seconds, memory, disk)
+
+
+def in_memory(spec: RunSpec) -> RunSpec:
+    """The spec with its updates in chunks, where the device's memory is short for all at once."""
+    device = jax.local_devices()[0]
+    limit = (device.memory_stats() or {}).get("bytes_limit")
+    if limit is None or _chunk(spec) == 1:
+        return spec
+    alone = dataclasses.replace(spec, seeds=spec.seeds[:1])
+    update, *_ = _compiled_update(make_agent(alone))
+    update_bytes = max(1, update.memory_analysis().temp_size_in_bytes)
+    fits = int(MEMORY_SHARE * limit - _memory(spec, update_bytes, 0)) // update_bytes
+    if fits >= _chunk(spec):
+        return spec
+    schedule = dataclasses.replace(
+        spec.config.schedule, mapping="chunks", mapping_chunk=max(1, fits)
+    )
+    return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
+
+
+def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
+    """The graph as a table: a row for each run, which names those it needs by number, and totals.
+
+    Time and disk add up; of memory the largest counts, for runs come one after another.
+
+    Args:
+      runs: from `graph.plan_runs`.
+      speed: from `measure`; not needed if nothing is missing.
+    """
+    rows, total = [], Estimate(0.0, 0, 0)
+    numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
+    for run in runs:
+        state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
+        tasks = "-" if run.spec is None else " + ".join(run.spec.tasks)
+        needs = ", ".join(numbers.get(name, name) for name in run.needs) or "-"
+        row = [f"{numbers[run.name]:>2}  {run.name}", str(len(run.cells)), tasks, needs, state]
+        if run.state in ("missing", "cut"):
+            one = estimate(run, speed)
+            row += [_duration(one.seconds), _size(one.memory), _size(one.disk)]
+            total = Estimate(
+                total.seconds + one.seconds, max(total.memory, one.memory), total.disk + one.disk
+            )
+        rows.append(row + ["-"] * (8 - len(row)))
+    agents = str(sum(len(run.cells) for run in runs))
+    rows.append(
+        ["    together", agents, "", "", "", _duration(total.seconds), _size(total.memory)]
+        + [_size(total.disk)]
+    )
+    header = ["run", "agents", "tasks", "needs", "state", "time", "memory", "disk"]
+    return aligned(header, rows)
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:,.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:,.1f} GiB" if count >= 2**30 else f"{count / 2**20:,.1f} MiB"

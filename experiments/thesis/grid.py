@@ -1,0 +1,278 @@
+"""The thesis's grid as data: targets and their sources, tables, figures, and the agents they need.
+
+Sections 4.2.1, 4.3.1 and 4.4.1. A cell is one agent: how it is trained, on what, and from what.
+Tables and figures name the cells that they show; cells name the cells that they transfer from, so
+the whole is a graph in which each agent occurs once, whoever asks for it.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from experiments import methods
+
+TASKS = ("HalfCheetah", "Hopper", "Walker2D", "InvertedPendulum", "InvertedDoublePendulum", "Ant")
+"""Titles of the six tasks, in the order of the thesis's tables."""
+
+SOURCES = {
+    "HalfCheetah": ("Hopper", "Ant", "Walker2D", "InvertedPendulum"),
+    "Hopper": ("HalfCheetah", "Walker2D", "Ant", "InvertedPendulum"),
+    "Walker2D": ("HalfCheetah", "Hopper", "Ant", "InvertedPendulum"),
+    "InvertedPendulum": ("HalfCheetah", "InvertedDoublePendulum", "Hopper", "Ant"),
+    "InvertedDoublePendulum": ("Hopper", "InvertedPendulum", "Walker2D", "Ant"),
+    "Ant": ("HalfCheetah", "Walker2D", "Hopper", "InvertedPendulum"),
+}
+"""Each target's sources: its agents of 2, 3 and 4 source tasks use the first so many."""
+
+COUNTS = (2, 3, 4)
+"""Numbers of source tasks."""
+OMEGAS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+"""Fractions of equation 19."""
+SEEDS = (0, 1, 2)
+"""Seeds of targets and baselines; a source agent is a single run, of the first of them."""
+THRESHOLDS = (50.0, 70.0, 90.0)
+"""Thresholds ξ of latent task classification, for M = 230 latent features."""
+AUTOENCODER = ("Hopper", "Ant")
+"""The tasks of the agent whose autoencoder is the universal one (section 4.3.1)."""
+
+Backend = Literal["bullet", "brax"]
+Metric = Literal["overall", "final"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One agent of the grid.
+
+    Attributes:
+      backend: the simulator.
+      tasks: titles of the tasks it is trained on, in the order of `TASKS`.
+      method: the name of one of `experiments.methods`.
+      seed: of the agent and of its simulators.
+      source: the agent whose parameters are transferred.
+      omega: the fraction of equation 19.
+      reward_sources: the agents whose reward models a meta-model reads, in order.
+    """
+
+    backend: Backend
+    tasks: tuple[str, ...]
+    method: str
+    seed: int
+    source: "Cell | None" = None
+    omega: float | None = None
+    reward_sources: tuple["Cell", ...] = ()
+
+    @property
+    def name(self) -> str:
+        """A name that no other cell has."""
+        words = [self.backend, "+".join(self.tasks), self.method]
+        words += methods.named(self.method).cell_words(self)
+        if self.source is not None:
+            words.append(f"source-seed={self.source.seed}")
+        return " ".join([*words, f"seed={self.seed}"])
+
+    @property
+    def needs(self) -> tuple["Cell", ...]:
+        """The cells that it transfers from."""
+        return (*([self.source] if self.source else []), *self.reward_sources)
+
+
+@dataclass(frozen=True)
+class Table:
+    """What a table of the thesis shows.
+
+    Attributes:
+      name: such as "table-3".
+      kind: "ftl" (fractional transfer to one target), "meta" (reward meta-models for all targets)
+        or "ltc" (latent task classification).
+      targets: titles of the target tasks; for "ltc" the novel ones.
+      metric: of the returns, see section 4.2.3; None for "ltc".
+      known: for "ltc", titles of the known tasks.
+      counts: numbers of source tasks.
+      omegas: fractions.
+      backend: the simulator.
+    """
+
+    name: str
+    kind: Literal["ftl", "meta", "ltc"]
+    targets: tuple[str, ...]
+    metric: Metric | None = None
+    known: tuple[str, ...] = ()
+    counts: tuple[int, ...] = COUNTS
+    omegas: tuple[float, ...] = OMEGAS
+    backend: Backend = "bullet"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What a figure of the thesis shows.
+
+    Attributes:
+      name: such as "figure-12".
+      kind: "tasks" (their pictures), "ftl", "meta" (learning curves of targets beside baselines),
+        "baselines", or "multitask" (a source agent on all its tasks, beside their baselines).
+      tasks: titles: of the pictures, of the target, of the baselines, of the source agent.
+      counts: numbers of source tasks.
+      omegas: fractions.
+      backend: the simulator.
+    """
+
+    name: str
+    kind: Literal["tasks", "ftl", "meta", "baselines", "multitask"]
+    tasks: tuple[str, ...]
+    counts: tuple[int, ...] = ()
+    omegas: tuple[float, ...] = OMEGAS
+    backend: Backend = "bullet"
+
+
+_METRICS: tuple[Metric, ...] = ("overall", "final")
+
+# Novel and known tasks of section 4.3.1, in the order of the tables' columns.
+_SPLITS = (
+    (
+        ("HalfCheetah", "InvertedDoublePendulum"),
+        ("Hopper", "Walker2D", "Ant", "InvertedPendulum"),
+    ),
+    (
+        ("Hopper", "Walker2D"),
+        ("HalfCheetah", "InvertedPendulum", "InvertedDoublePendulum", "Ant"),
+    ),
+    (
+        ("Ant", "InvertedPendulum"),
+        ("Hopper", "Walker2D", "InvertedDoublePendulum", "HalfCheetah"),
+    ),
+)
+
+# Tables 16 and 17 name Walker2D after InvertedPendulum.
+_META_TARGETS = (
+    "HalfCheetah",
+    "Hopper",
+    "InvertedPendulum",
+    "Walker2D",
+    "InvertedDoublePendulum",
+    "Ant",
+)
+
+TABLES = {
+    table.name: table
+    for table in (
+        *(
+            Table(f"table-{2 * i + j + 1}", "ftl", (target,), metric)
+            for i, target in enumerate(TASKS)
+            for j, metric in enumerate(_METRICS)
+        ),
+        *(
+            Table(f"table-{13 + i}", "ltc", novel, known=known)
+            for i, (novel, known) in enumerate(_SPLITS)
+        ),
+        *(
+            Table(f"table-{16 + i}", "meta", _META_TARGETS, metric)
+            for i, metric in enumerate(_METRICS)
+        ),
+    )
+}
+"""Tables 1 to 17 by name."""
+
+FIGURES = {
+    figure.name: figure
+    for figure in (
+        Figure("figure-10", "tasks", ("HalfCheetah", "Hopper", "Walker2D", "Ant")),
+        Figure("figure-11", "tasks", ("InvertedPendulum", "InvertedDoublePendulum")),
+        *(
+            Figure(f"figure-{12 + 3 * i + j}", "ftl", (target,), (count,))
+            for i, target in enumerate(TASKS)
+            for j, count in enumerate(COUNTS)
+        ),
+        *(Figure(f"figure-{30 + i}", "meta", (target,), COUNTS) for i, target in enumerate(TASKS)),
+        Figure("figure-36", "baselines", TASKS),
+        Figure("figure-37", "multitask", ("InvertedPendulum", "Hopper")),
+        Figure("figure-38", "multitask", ("InvertedPendulum", "Walker2D", "Hopper")),
+        Figure("figure-39", "multitask", ("InvertedPendulum", "Walker2D", "Hopper", "Ant")),
+    )
+}
+"""Figures 10 to 39 by name. Figures 1 to 9 are diagrams."""
+
+DEMO = Table("demo", "ftl", ("InvertedPendulum",), "overall", counts=(2,), omegas=(0.0, 0.2, 0.4))
+"""A part of Table 7 that is done in minutes, with seeds 0 and 1."""
+
+
+def baseline(backend: Backend, task: str, seed: int) -> Cell:
+    """An agent from scratch on one task."""
+    return Cell(backend, (task,), "scratch", seed)
+
+
+def multitask(backend: Backend, tasks: Iterable[str], seed: int) -> Cell:
+    """A source agent on several tasks, the same whatever order they are named in."""
+    tasks = set(tasks)
+    return Cell(backend, tuple(task for task in TASKS if task in tasks), "scratch", seed)
+
+
+def fractional(backend: Backend, target: str, count: int, omega: float, seed: int, source: int):
+    """A target of fractional transfer from `count` tasks; `source` is the source agent's seed."""
+    agent = multitask(backend, SOURCES[target][:count], source)
+    return Cell(backend, (target,), "fractional", seed, agent, omega)
+
+
+def on_autoencoder(backend: Backend, task: str, source: int) -> Cell:
+    """A single-source agent on the universal autoencoder, which a meta-model's target reads."""
+    return Cell(backend, (task,), "uae", source, multitask(backend, AUTOENCODER, source))
+
+
+def meta(backend: Backend, target: str, count: int, seed: int, source: int) -> Cell:
+    """A target with a reward meta-model over `count` stored reward models."""
+    stored = tuple(on_autoencoder(backend, task, source) for task in SOURCES[target][:count])
+    autoencoder = multitask(backend, AUTOENCODER, source)
+    return Cell(backend, (target,), "meta", seed, autoencoder, reward_sources=stored)
+
+
+def shown(entry: Table | Figure, seeds: tuple[int, ...] = SEEDS) -> tuple[Cell, ...]:
+    """The cells that a table or figure shows, baselines last.
+
+    A table of latent task classification shows samples of one agent; figures of the tasks none.
+    """
+    backend, source = entry.backend, seeds[0]
+    if entry.kind == "ltc":
+        return (multitask(backend, AUTOENCODER, source),)
+    if entry.kind == "tasks":
+        return ()
+    targets = entry.targets if isinstance(entry, Table) else entry.tasks
+    scratch = tuple(baseline(backend, task, seed) for task in targets for seed in seeds)
+    if entry.kind == "baselines":
+        return scratch
+    if entry.kind == "multitask":
+        return (multitask(backend, targets, source), *scratch)
+    if entry.kind == "meta":
+        cells = (
+            meta(backend, target, count, seed, source)
+            for target in targets
+            for count in entry.counts
+            for seed in seeds
+        )
+    else:
+        cells = (
+            fractional(backend, target, count, omega, seed, source)
+            for target in targets
+            for count in entry.counts
+            for omega in entry.omegas
+            for seed in seeds
+        )
+    return (*cells, *scratch)
+
+
+def closure(cells: Iterable[Cell]) -> tuple[Cell, ...]:
+    """The cells and all that they need, each once, what is needed before what needs it."""
+    ordered: dict[Cell, None] = {}
+
+    def visit(cell: Cell) -> None:
+        for needed in cell.needs:
+            visit(needed)
+        ordered.setdefault(cell)
+
+    for cell in cells:
+        visit(cell)
+    return tuple(ordered)
+
+
+def on_backend(entry: Table | Figure, backend: Backend) -> Table | Figure:
+    """The same table or figure on another simulator."""
+    return dataclasses.replace(entry, backend=backend)

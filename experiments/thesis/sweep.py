@@ -1,0 +1,173 @@
+"""Runs planned runs one after another: what was cut goes on, what fails is named, the rest goes on.
+
+A run whose folder is damaged is set aside: renamed, never deleted. Those that need it are left for
+the next time.
+"""
+
+import contextlib
+import fcntl
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import jax
+
+from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
+from dreamer_jax.files import write_json_atomically
+from dreamer_jax.training import NonFiniteError
+from envs import SimulatorError
+from experiments.runs.folder import CELLS, begun, set_aside
+from experiments.runs.run import carry_out, make_run
+from experiments.thesis.estimate import in_memory
+from experiments.thesis.graph import PlannedRun
+
+
+@dataclass
+class Progress:
+    """What became of planned runs.
+
+    Attributes:
+      finished: names of the runs that were trained to their end.
+      failed: those that were not, and why.
+      skipped: those that need one of these, and which.
+      stopped: whether Ctrl-C ended it.
+    """
+
+    finished: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    stopped: bool = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing failed and nothing is left."""
+        return not (self.failed or self.skipped or self.stopped)
+
+
+Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
+
+
+def train(run: PlannedRun, root: Path, workers: int | None) -> Literal["finished", "stopped"]:
+    """Begins a run or goes on with it, until it is done or stopped.
+
+    Raises:
+      ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
+      SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
+    """
+    folder, spec = root / run.name, run.spec
+    if not begun(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        # Of a run that was stopped before anything was kept, perhaps one of other cells.
+        (folder / "run.json").unlink(missing_ok=True)
+        write_json_atomically(folder / CELLS, list(run.cells))
+        spec = in_memory(spec)
+    try:
+        return carry_out(make_run(spec, folder, resume=True, workers=workers, base=root))
+    finally:
+        # The programs of its simulators serve no other run, and take up to 100 MiB a task.
+        jax.clear_caches()
+
+
+def carry_out_runs(
+    runs: Sequence[PlannedRun],
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    train: Train = train,
+    say: Callable[[str], None] = print,
+) -> Progress:
+    """Trains what is missing and goes on with what was cut, in the order given.
+
+    Args:
+      runs: from `graph.plan_runs`.
+      root: the folder of all results.
+      workers: simulator processes; by default one per core.
+      train: what trains one run.
+      say: where messages go.
+
+    Raises:
+      ValueError: another process trains runs under the same root.
+    """
+    root, progress = Path(root), Progress()
+    due = [run for run in runs if run.state in ("missing", "cut")]
+    with _alone(root) if due else contextlib.nullcontext():
+        for run in runs:
+            if run.state == "corrupt":
+                progress.failed[run.name] = _aside(root / run.name, run.problem)
+        _carry_out(due, root, progress, workers, train, say)
+    return progress
+
+
+@contextlib.contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Keeps other processes from training runs under a root, until this one is done or dead."""
+    root.mkdir(parents=True, exist_ok=True)
+    with open(root / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"another command is training in {root}: wait until it is done, or name another "
+                "folder with --results"
+            ) from None
+        yield
+
+
+def _carry_out(
+    due: list[PlannedRun],
+    root: Path,
+    progress: Progress,
+    workers: int | None,
+    train: Train,
+    say: Callable[[str], None],
+) -> None:
+    checked: set[str] = set()
+    for number, run in enumerate(due, start=1):
+        _check_needs(run, root, progress, checked)
+        if broken := [name for name in run.needs if _lost(name, progress)]:
+            progress.skipped[run.name] = f"it needs {', '.join(broken)}"
+            continue
+        verb = f"goes on at {run.progress:.0%}" if run.state == "cut" else "begins"
+        say(f"run {number} of {len(due)}, {run.name}: {_described(run)}; it {verb}")
+        try:
+            outcome = train(run, root, workers)
+        except (ValueError, CorruptCheckpointError) as error:
+            damaged = begun(root / run.name)
+            progress.failed[run.name] = (
+                _aside(root / run.name, str(error)) if damaged else str(error)
+            )
+        except (SimulatorError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
+            progress.failed[run.name] = f"{error} (it is kept as it is; the same command goes on)"
+        else:
+            if outcome == "stopped":
+                progress.stopped = True
+                return
+            progress.finished.append(run.name)
+
+
+def _described(run: PlannedRun) -> str:
+    agents = f"{len(run.cells)} agents" if len(run.cells) > 1 else "1 agent"
+    return f"{agents} on {' + '.join(run.spec.tasks)}"
+
+
+def _lost(name: str, progress: Progress) -> bool:
+    return name in progress.failed or name in progress.skipped
+
+
+def _aside(folder: Path, problem: str) -> str:
+    return f"{problem}; it was set aside as {set_aside(folder).name}, and trains anew next time"
+
+
+def _check_needs(run: PlannedRun, root: Path, progress: Progress, checked: set[str]) -> None:
+    """Reads the newest checkpoint of what a run needs, so that a damaged one is set aside itself
+    and not what would have been made from it."""
+    for name in run.needs:
+        checkpoints = Checkpointer(root / name / "checkpoints")
+        if name in checked or _lost(name, progress) or checkpoints.latest() is None:
+            continue
+        try:
+            load_tree(checkpoints.path(checkpoints.latest()), subtree="agent/params")
+        except CorruptCheckpointError as error:
+            progress.failed[name] = _aside(root / name, str(error))
+        checked.add(name)
