@@ -32,7 +32,7 @@ AUTOMATIC_SHARE = 0.5
 """Share of an accelerator's memory that a replay may take without being asked for."""
 
 
-def on_device(agent: Agent, env, tasks: int, members: int) -> tuple[bool, str]:
+def on_device(agent: Agent, has_host: bool, tasks: int, members: int) -> tuple[bool, str]:
     """Whether the rounds of a run are one program each, with the replay on the device, and why.
 
     By the setting `replay` of the schedule: "files", "device", or "auto", which is the device on an
@@ -41,7 +41,7 @@ def on_device(agent: Agent, env, tasks: int, members: int) -> tuple[bool, str]:
 
     Args:
       agent: its functions and settings.
-      env: the environment; unless its attribute `has_host` is False, it needs the host.
+      has_host: whether anything of the environment runs on the host.
       tasks: K.
       members: P.
 
@@ -52,7 +52,7 @@ def on_device(agent: Agent, env, tasks: int, members: int) -> tuple[bool, str]:
       ValueError: "device" was asked for, and the environment has a host or the replay does not fit.
     """
     schedule = Schedule(agent.config.schedule, tasks)
-    choice, has_host = agent.config.schedule.replay, getattr(env, "has_host", True)
+    choice = agent.config.schedule.replay
     if choice == "files" or (choice == "auto" and has_host):
         return False, ""
     if has_host:

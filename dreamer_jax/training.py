@@ -134,7 +134,9 @@ class Run:
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
-        one_program, self._replay_note = on_device(agent, env, len(self.tasks), len(self.members))
+        one_program, self._replay_note = on_device(
+            agent, getattr(env, "has_host", True), len(self.tasks), len(self.members)
+        )
         self.videos = videos
         self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
         self.checkpoints = Checkpointer(self.directory / "checkpoints")

@@ -49,6 +49,11 @@ class TaskSpec:
     supersample: int = 1
     renderer: str = ""
 
+    @property
+    def has_host(self) -> bool:
+        """Whether a simulator or a renderer of it runs on the host."""
+        return self.renderer != "jax"
+
 
 class TimeStep(NamedTuple):
     """What one tick of an environment gives. Every leaf gets the leading axes of a `vmap`.

@@ -256,14 +256,20 @@ def test_a_replay_of_other_phases_is_refused(tmp_path):
 # Which it is
 
 
-def choice(setting, env=ENV, **settings):
-    return on_device(Agent(config_with(replay=setting, **settings), 2), env, 2, 2)
+def choice(setting, has_host=False):
+    return on_device(Agent(config_with(replay=setting), 2), has_host, 2, 2)
 
 
 def test_an_environment_with_a_host_is_refused_unless_files_are_a_choice():
     with pytest.raises(ValueError, match="on the host: choose replay=files, or tasks such as brax"):
-        choice("device", Probe())
-    assert choice("auto", Probe()) == choice("files", Probe()) == (False, "")
+        choice("device", True)
+    assert choice("auto", True) == choice("files", True) == (False, "")
+
+
+def test_an_environment_that_does_not_say_is_taken_to_have_a_host(tmp_path):
+    with pytest.raises(ValueError, match="choose replay=files"):
+        Run(AGENT, Probe(), TASKS, MEMBERS, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_cpu_keeps_files_unless_told_otherwise():

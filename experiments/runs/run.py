@@ -17,6 +17,7 @@ import numpy as np
 
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
+from dreamer_jax.device_round import on_device
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.training import Run
 from experiments.runs.agents import make_agent, make_env
@@ -92,6 +93,8 @@ def make_run(
     agent = make_agent(spec)
     env = make_env(spec, workers=workers)
     try:
+        # What cannot be had is refused before the folder is made.
+        on_device(agent, env.has_host, len(spec.tasks), len(spec.members))
         directory.mkdir(parents=True, exist_ok=True)
         if report is not None:
             write_report(report, directory)
