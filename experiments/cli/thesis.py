@@ -241,8 +241,8 @@ def plan(command: Plan) -> int:
         )
         if speed.scaled > 1:
             print(
-                f"The update was measured on smaller batches, and multiplied by {speed.scaled:.3g}: "
-                f"expect its time and memory to be off by up to {estimate.SCALING_ERROR:.0%}."
+                "The update was measured on smaller batches, and multiplied by "
+                f"{speed.scaled:.3g}: its time may be off by {estimate.SCALING_ERROR:.0%}."
             )
     return 0
 
