@@ -28,6 +28,11 @@ from experiments.runs.text import aligned
 from experiments.thesis.graph import PlannedRun
 
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
+SLACK = 1.5
+"""How much longer a run may take than what is counted of it."""
+NAME_COLUMNS = 30
+DUE = ("missing", "cut")
+"""States of the runs that still take time."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,8 @@ class Speed:
     """What was measured.
 
     Attributes:
-      update_seconds: one update of one member.
+      update_seconds: one update of one member, half of those measured taking less.
+      update_range: seconds that a tenth of the measured updates took less than, and a tenth more.
       update_bytes: memory that it takes beside the member's state and batch.
       policy_seconds: choosing one action for one member.
       tick_seconds: one tick of one simulator, by name of task.
@@ -46,6 +52,7 @@ class Speed:
     """
 
     update_seconds: float
+    update_range: tuple[float, float]
     update_bytes: int
     policy_seconds: float
     tick_seconds: Mapping[str, float]
@@ -119,18 +126,20 @@ def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what:
     state = jax.tree.map(jnp.copy, state)
     state, sums, loss = update(state, jax.tree.map(jnp.copy, sums), batch)
     loss.block_until_ready()
-    updates, started = 0, time.perf_counter()
-    while time.perf_counter() - started < UPDATE_SECONDS:
+    took: list[float] = []
+    while sum(took) < UPDATE_SECONDS:
+        started = time.perf_counter()
         state, sums, loss = update(state, sums, batch)
         loss.block_until_ready()
-        updates += 1
-    update_seconds = (time.perf_counter() - started) / updates
+        took.append(time.perf_counter() - started)
+    fast, middle, slow = np.quantile(took, [0.1, 0.5, 0.9]).tolist()
     ticks = {}
     for number, task in enumerate(tasks, start=2):
         tell(f"[{number}/{things}] {task}")
         ticks[task] = _tick_seconds(task, agent.config)
     return Speed(
-        update_seconds=update_seconds,
+        update_seconds=middle,
+        update_range=(fast, slow),
         update_bytes=update_bytes,
         policy_seconds=policy_seconds,
         tick_seconds={task: each for task, (each, _) in ticks.items()},
@@ -268,43 +277,75 @@ def in_memory(spec: RunSpec) -> RunSpec:
     return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
 
 
+def together(runs: Sequence[PlannedRun], speed: Speed | None) -> Estimate:
+    """What all runs still take: time and disk add up, of memory the largest counts.
+
+    Args:
+      runs: from `graph.plan_runs`; they come one after another.
+      speed: from `measure`; not needed if nothing is missing.
+    """
+    each = [estimate(run, speed) for run in runs if run.state in DUE]
+    return Estimate(
+        sum(one.seconds for one in each),
+        max((one.memory for one in each), default=0),
+        sum(one.disk for one in each),
+    )
+
+
 def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
     """The graph as a table: a row for each run, which names those it needs by number, and totals.
 
-    Time and disk add up; of memory the largest counts, for runs come one after another.
+    At most 100 columns wide: names that are longer go on in further lines.
 
     Args:
       runs: from `graph.plan_runs`.
       speed: from `measure`; not needed if nothing is missing.
     """
-    rows, total = [], Estimate(0.0, 0, 0)
+    rows = []
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
-        tasks = "-" if run.spec is None else " + ".join(run.spec.tasks)
-        needs = ", ".join(numbers.get(name, name) for name in run.needs) or "-"
-        row = [f"{numbers[run.name]:>2}  {run.name}", str(len(run.cells)), tasks, needs, state]
-        if run.state in ("missing", "cut"):
-            one = estimate(run, speed)
-            row += [_duration(one.seconds), _size(one.memory), _size(one.disk)]
-            total = Estimate(
-                total.seconds + one.seconds, max(total.memory, one.memory), total.disk + one.disk
-            )
-        rows.append(row + ["-"] * (8 - len(row)))
+        needs = ",".join(numbers.get(name, "?") for name in run.needs) or "-"
+        first, *more = _lines(run.name)
+        row = [f"{numbers[run.name]:>2}  {first}", str(len(run.cells)), needs, state]
+        if run.state in DUE:
+            row += _in_words(estimate(run, speed), speed)
+        rows.append(row + ["-"] * (7 - len(row)))
+        rows += [[f"      {line}", *[""] * 6] for line in more]
     agents = str(sum(len(run.cells) for run in runs))
-    rows.append(
-        ["    together", agents, "", "", "", _duration(total.seconds), _size(total.memory)]
-        + [_size(total.disk)]
-    )
-    header = ["run", "agents", "tasks", "needs", "state", "time", "memory", "disk"]
-    return aligned(header, rows)
+    total = ["-"] * 3 if speed is None else _in_words(together(runs, speed), speed)
+    rows.append(["    together", agents, "", "", *total])
+    return aligned(["run", "agents", "needs", "state", "time", "memory", "disk"], rows)
 
 
-def _duration(seconds: float) -> str:
+def _lines(name: str) -> list[str]:
+    """A name in lines of at most so many letters as fit, broken after - and + where it can be."""
+    lines, rest = [], name
+    while len(rest) > NAME_COLUMNS:
+        place = max(rest.rfind(sign, 0, NAME_COLUMNS) for sign in "-+") + 1 or NAME_COLUMNS
+        lines.append(rest[:place])
+        rest = rest[place:]
+    return [*lines, rest]
+
+
+def _in_words(one: Estimate, speed: Speed) -> list[str]:
+    """Time as a range, memory and disk."""
+    return [span(one.seconds, speed), _size(one.memory), _size(one.disk)]
+
+
+def span(seconds: float, speed: Speed) -> str:
+    """A time as a range, such as "2.1 to 4.5 h".
+
+    From what it takes if all updates are as fast as the fastest tenth of those measured, to what it
+    takes if all are as slow as the slowest tenth and as much again as SLACK goes to what is not
+    counted: evaluations' videos, checkpoints, and whatever else the machine does.
+    """
+    fast, slow = (each / speed.update_seconds for each in speed.update_range)
+    low, high = seconds * fast, seconds * slow * SLACK
     for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:,.1f} {unit}"
-    return f"{seconds:.0f} s"
+        if high >= 2 * length:
+            return f"{low / length:,.1f} to {high / length:,.1f} {unit}"
+    return f"{low:.0f} to {high:.0f} s"
 
 
 def _size(count: int) -> str:
