@@ -8,6 +8,7 @@ Axis letters: P population member, K task, T ticks in a phase, A action.
 
 import dataclasses
 import functools
+import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
@@ -76,12 +78,12 @@ class Estimate:
     disk: int
 
 
-def _batch(agent: Agent, members: int) -> Batch:
+def _batch(agent: Agent, members: int) -> Records:
     """Records of the sizes of a batch, leaves [P, B, L, ...]."""
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (members, learning.batch_size, learning.sequence_length)
     random = np.random.default_rng(0)
-    return Batch(
+    return Records(
         image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
         action=np.zeros((*shape, agent.action_size), np.float32),
         reward=np.zeros(shape, np.float32),
@@ -311,7 +313,9 @@ def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
         if run.state in DUE:
             row += _in_words(estimate(run, speed), speed)
         rows.append(row + ["-"] * (7 - len(row)))
-        rows += [[f"      {line}", *[""] * 6] for line in more]
+        told = [f"{len(run.failed)} failed"] if run.failed else []
+        for line, word in itertools.zip_longest(more, told, fillvalue=""):
+            rows.append([f"      {line}", "", "", word, "", "", ""])
     agents = str(sum(len(run.cells) for run in runs))
     total = ["-"] * 3 if speed is None else _in_words(together(runs, speed), speed)
     rows.append(["    together", agents, "", "", *total])
