@@ -111,7 +111,9 @@ def filled(files: Replay, capacity: int, records: int) -> Records:
         ]
         missing = start - phase * records
         rows = {
-            name: np.stack([[_padded(getattr(stream, name), missing) for stream in row] for row in streams])
+            name: np.stack(
+                [[_padded(getattr(stream, name), missing) for stream in row] for row in streams]
+            )
             for name in files.dtype.names
         }
         held = store(held, Records(**rows), jnp.int32(phase))

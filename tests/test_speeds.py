@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 
 from dreamer_jax.config import preset
-from experiments.__main__ import main
 from experiments.cli import thesis
+from experiments.cli.main import main
 from experiments.runs.spec import RunSpec
 from experiments.thesis import speeds
 from experiments.thesis.estimate import Speed
