@@ -25,7 +25,10 @@ from dreamer_jax.population import init_members, update_members, zero_sums
 
 members, (batch, length, size, actions) = 3, (2, 5, 32, 2)
 agent = Agent(preset("debug"), actions)
-state = init_members(agent, jnp.arange(members))
+# Compiled quickly. Not by an environment variable: there is none that a user must know.
+quick = {"xla_backend_optimization_level": 0}
+seeds = jnp.arange(members)
+state = init_members.lower(agent, seeds).compile(quick)(seeds)
 shape = (members, batch, length)
 batches = Batch(
     np.zeros((*shape, size, size, 3), np.uint8),
@@ -35,7 +38,9 @@ batches = Batch(
     np.zeros(shape, bool),
 )
 sums = zero_sums(agent, state, batch, length)
-state, _, loss = update_members(agent, state, sums, batches, mapping="auto", chunk=1)
+options = dict(mapping="auto", chunk=1)
+update = update_members.lower(agent, state, sums, batches, **options).compile(quick)
+state, _, loss = update(state, sums, batches)
 print("updated", state.updates.tolist(), bool(jnp.isfinite(loss).all()))
 """
 
