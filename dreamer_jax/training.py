@@ -20,16 +20,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, AgentState, Batch, Mode
-from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
+from dreamer_jax.agent import Agent, Mode
+from dreamer_jax.device_round import DeviceRounds, on_device
 from dreamer_jax.diagnosis import diagnose, warnings
-from dreamer_jax.logs import MetricsWriter
+from dreamer_jax.learning import AgentState
+from dreamer_jax.locks import FolderLock
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Progress
-from dreamer_jax.replay import Replay
-from dreamer_jax.rollout import Records, collect, episodes
+from dreamer_jax.record_checks import check_records
+from dreamer_jax.records import Records
+from dreamer_jax.rollout import collect, episodes
+from dreamer_jax.run_folder import RunFolder
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.video import tile, write_video
+from dreamer_jax.waiting import to_host
 
 MAXIMUM_VIDEO_MEMBERS = 9
 
@@ -54,20 +58,26 @@ class NonFiniteError(FloatingPointError):
 
 
 class StopRequest:
-    """Turns the first Ctrl-C (or SIGTERM) into a request to stop, and lets a second one quit.
+    """Turns the first Ctrl-C (or SIGTERM, or the terminal's end) into a request to stop, and lets a
+    second one quit.
 
     A context manager; outside the main thread it does nothing, as Python allows no more.
+
+    Args:
+      notify: is told of the request in words.
+      hurry: called at the request, so that nothing that hangs is waited for.
     """
 
-    def __init__(self, notify: Callable[[str], None]):
+    def __init__(self, notify: Callable[[str], None], hurry: Callable[[], None]):
         self.requested = False
-        self._notify = notify
+        self._notify, self._hurry = notify, hurry
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+                    self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_) -> None:
@@ -78,6 +88,7 @@ class StopRequest:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+        self._hurry()
         self._notify("stopping: saving first (once more to quit without)")
 
 
@@ -86,16 +97,20 @@ class Run:
 
     Args:
       agent: the agent's functions; `agent.config` holds the schedule too.
-      env: an environment of P * K slots (see `dreamer_jax.rollout`), with a method `check()` that
-        raises what its simulators met.
+      env: an environment of P * K slots (see `dreamer_jax.rollout`), with methods `check()`, which
+        raises what its simulators met, and perhaps `hurry()`, after which it waits for none long.
       tasks: the names of the K tasks.
       members: the P members.
       directory: metrics, checkpoints, replay and videos go here.
       state: agents to start from, leaves [P, ...]; fresh ones by default.
       resume: continue from the folder's newest checkpoint (or from the start if there is none).
       videos: how many of the evaluations are also written as videos, spread over the run.
+      from_checkpoint: step of an older checkpoint to continue from; later ones are removed.
+      lock: the folder's lock, if the caller holds it; it is released with the run.
 
     Raises:
+      FolderInUseError: another process works in the folder.
+      DamagedError, CorruptCheckpointError: what the folder holds is not what was written.
       FileExistsError: the folder holds a run, and `resume` is False.
       ValueError: sizes of the environment, the members and the state do not fit together.
     """
@@ -111,6 +126,8 @@ class Run:
         state: AgentState | None = None,
         resume: bool = False,
         videos: int = 10,
+        from_checkpoint: int | None = None,
+        lock: FolderLock | None = None,
     ):
         config = agent.config
         if env.action_size != agent.action_size:
@@ -133,70 +150,57 @@ class Run:
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
+        self._one_program, self._replay_note = on_device(
+            agent, getattr(env, "has_host", True), len(self.tasks), len(self.members)
+        )
         self.videos = videos
         self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
-        self.checkpoints = Checkpointer(self.directory / "checkpoints")
-        self._check_folder(resume)
-
-        self.replay = Replay(
-            self.directory / "replay",
-            members=len(self.members),
-            tasks=len(self.tasks),
-            image_size=config.network.image_size,
-            action_size=agent.action_size,
-            keep=config.schedule.replay_keep,
+        self.folder = RunFolder(
+            self.directory,
+            lock=lock,
+            resume=resume or from_checkpoint is not None,
+            layout={
+                "members": len(self.members),
+                "tasks": len(self.tasks),
+                "image_size": config.network.image_size,
+                "action_size": agent.action_size,
+                "keep": config.schedule.replay_keep,
+            },
         )
-        self.writer = MetricsWriter(self.directory)
+        self.checkpoints, self.replay = self.folder.checkpoints, self.folder.replay
+        self.writer = self.folder.writer
+        try:
+            self._start(state, from_checkpoint)
+        except BaseException:
+            self.folder.close()
+            raise
+
+    def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
+        """Takes up what the folder holds, or else the state given, or else fresh agents."""
+        agent = self.agent
+        # Where rounds are one program each; None where updates read the files.
+        self.device_rounds = (
+            DeviceRounds(agent, self.env, self.replay, self.seeds) if self._one_program else None
+        )
         self.counters = Counters()
         self.state = init_members(agent, self.seeds) if state is None else state
         if self.state.updates.shape != (len(self.members),):
             raise ValueError(
                 f"the state holds {self.state.updates.shape} members, {len(self.members)} are named"
             )
-        learning = config.learning
+        learning = agent.config.learning
         self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
-        self._restore()
+        found = self.folder.restore({"agent": self.state, "sums": self.sums}, from_checkpoint)
+        if found is not None:
+            self.state, self.sums = found[0]["agent"], found[0]["sums"]
+            self.counters = Counters(**found[1])
         self._healthy = np.asarray(self.state.healthy)
         self._warned: set[tuple[int, str]] = set()
 
-    # The folder.
-
-    def _check_folder(self, resume: bool) -> None:
-        if not resume and (self.directory / "replay").exists():
-            raise FileExistsError(
-                f"{self.directory} already holds a run: resume it, or choose another folder"
-            )
-
-    def _restore(self) -> None:
-        """Goes back to the newest checkpoint, or to nothing if there is none."""
-        lengths, offset = np.zeros_like(self.replay.lengths), 0
-        if self.checkpoints.latest() is not None:
-            template = {"agent": self.state, "sums": self.sums}
-            restored, metadata, _ = self.checkpoints.restore(template)
-            self.state, self.sums = restored["agent"], restored["sums"]
-            self.counters = Counters(**metadata["counters"])
-            lengths, offset = metadata["replay"], metadata["metrics"]
-        self.replay.truncate(np.asarray(lengths))
-        self.writer.truncate(offset)
-
     def save(self) -> None:
         """Writes a checkpoint of everything that a resumed run needs."""
-        metadata = {
-            "counters": dataclasses.asdict(self.counters),
-            "replay": self.replay.lengths,
-            "metrics": self.writer.offset(),
-        }
-        self.checkpoints.save(self._step(), {"agent": self.state, "sums": self.sums}, metadata)
-        self._delete_records()
-
-    def _delete_records(self) -> None:
-        """Deletes the records that are too old for every checkpoint."""
-        checkpoints = self.checkpoints
-        try:
-            lengths = [checkpoints.metadata(step)["replay"] for step in checkpoints.steps()]
-        except CorruptCheckpointError:
-            return  # until it has been replaced
-        self.replay.delete(np.min(lengths, axis=0))
+        tree = {"agent": self.state, "sums": self.sums}
+        self.folder.save(self._step(), tree, dataclasses.asdict(self.counters))
 
     def _step(self) -> int:
         """A number that grows with every action."""
@@ -217,8 +221,10 @@ class Run:
         schedule = self.schedule
         with (
             self._progress_bar() as self._bar,
-            StopRequest(self._bar.message) as stop,
+            StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
+            if self._replay_note:
+                self._bar.message(self._replay_note)
             if self.checkpoints.latest() is None:
                 self.save()
             saved_steps = schedule.environment_steps(self.counters.rounds)
@@ -234,19 +240,22 @@ class Run:
                     elif action == "evaluate":
                         self._evaluate()
                     else:
-                        self._collect("random" if action == "prefill" else "explore")
+                        self._round("random" if action == "prefill" else "explore")
                 except (KeyboardInterrupt, NonFiniteError):
                     raise
-                except Exception:
+                except Exception as error:
                     # Nothing of the failed action has been committed.
                     self.save()
-                    raise
+                    if not stop.requested:
+                        raise
+                    self._bar.message(f"this phase is given up: {error}")
+                    return "stopped"
             self.save()
         return "finished" if action == "done" else "stopped"
 
     def close(self) -> None:
-        """Closes the metrics files. The environment belongs to the caller."""
-        self.writer.close()
+        """Closes the folder. The environment belongs to the caller."""
+        self.folder.close()
 
     def _progress_bar(self) -> Progress:
         return Progress(
@@ -284,19 +293,47 @@ class Run:
             ticks=self.schedule.config.phase_ticks,
             mode=mode,
         )
-        records = Records(*(np.asarray(x) for x in records))
+        records = to_host(records)
         self.env.check()
+        check_records(records, self.tasks)
         self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
-    def _collect(self, mode: Literal["random", "explore"]) -> None:
+    def _round(self, mode: Literal["random", "explore"]) -> None:
+        """Collects, and in one program with that makes the updates that are then due, if rounds
+        are one program each."""
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
+        if self.device_rounds is None:
+            self._commit(self._phase(mode, self.counters.rounds), mode)
+            return
+        started, rounds = time.perf_counter(), self.counters.rounds
+        updates = range(self.counters.updates, self.schedule.updates_due(rounds + 1))
+        try:
+            self.state, self.sums, records = self.device_rounds.run(
+                self.state, self.sums, rounds, updates, mode
+            )
+            self.env.check()
+            check_records(records, self.tasks)
+            self._time("round", started, updates=len(updates))
+            self._commit(records, mode)
+        except Exception:
+            # The agents from before the round are used up.
+            self.device_rounds.forget()
+            self._restore()
+            raise
+        if updates:
+            averaged = self.counters.averaged + len(updates)
+            self._advance(updates=updates.stop, averaged=averaged)
+            self._bar.update(updates=updates.stop)
+            self._write_averages()
+
+    def _commit(self, records: Records, mode: Literal["random", "explore"]) -> None:
+        """Writes a phase to the replay, and what it brought to the metrics."""
         rounds = self.counters.rounds
-        records = self._phase(mode, rounds)
-        self.replay.append(records._asdict())
+        self.replay.append(records)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            found = episodes(Records(*(x[member, task] for x in records)))
+            found = episodes(records.at(member, task))
             scores.append(np.mean([episode.score for episode in found]))
             row = {
                 "kind": "collect",
@@ -331,7 +368,7 @@ class Run:
                     self.agent,
                     self.state,
                     self.sums,
-                    Batch(**batch),
+                    batch,
                     mapping=schedule.mapping,
                     chunk=schedule.mapping_chunk,
                 )
@@ -398,7 +435,7 @@ class Run:
         diagnosis = jax.device_get(found)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            episode = episodes(Records(*(x[member, task] for x in records)))[0]
+            episode = episodes(records.at(member, task))[0]
             scores.append(episode.score)
             row = {
                 "kind": "evaluation",

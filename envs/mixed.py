@@ -42,6 +42,7 @@ class MixedEnv:
         self.parts = tuple(parts)
         self.members = members
         self.image_size, self.action_size = parts[0].image_size, parts[0].action_size
+        self.has_host = any(part.has_host for part in parts)
         self._tasks = sum(map(len, places))
         # For each task, its environment and its number there.
         self._part_of = [0] * self._tasks
@@ -75,6 +76,11 @@ class MixedEnv:
                 errors.append(error)
         if errors:
             raise errors[0]
+
+    def hurry(self) -> None:
+        """Wait no longer than a few seconds for simulators from now on."""
+        for part in self.parts:
+            part.hurry()
 
     def close(self) -> None:
         """Close every environment."""

@@ -13,7 +13,7 @@ import pytest
 from compilation import update_with_quick_code
 from dreamer_jax import config as configs
 from dreamer_jax import training
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import update_members
@@ -113,7 +113,7 @@ def test_updates_are_not_compiled_again_after_the_first(finished):
     batch = run.replay.sample([0, 7], 0, learning.batch_size, learning.sequence_length)
     state = jax.tree.map(jnp.copy, run.state)
     sums = jax.tree.map(jnp.copy, run.sums)
-    update_members(AGENT, state, sums, Batch(**batch), mapping="auto", chunk=1)
+    update_members(AGENT, state, sums, batch, mapping="auto", chunk=1)
     assert update_members._cache_size() == before
 
 
@@ -352,7 +352,7 @@ def test_discrete_choices_are_learned_with_their_values(tmp_path, monkeypatch):
     random = [row["return"] for row in rows if row.get("policy") == "random"]
     assert np.mean(random) < 0.5 * ticks
     # Discount 0.5: values 2, 1 and 0.5 at distances 0, 1 and 2.
-    batch = Batch(**run.replay.sample([0], 10**6, 50, 8))
+    batch = run.replay.sample([0], 10**6, 50, 8)
     params = jax.tree.map(lambda x: x[0], run.state.params)
     batch = jax.tree.map(lambda x: x[0], batch)
     posterior, _, _ = jax.jit(agent.observe)(params, batch, jax.random.key(0))

@@ -17,9 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
+from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
@@ -69,12 +71,12 @@ class Estimate:
     disk: int
 
 
-def _batch(agent: Agent, members: int) -> Batch:
+def _batch(agent: Agent, members: int) -> Records:
     """Records of the sizes of a batch, leaves [P, B, L, ...]."""
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (members, learning.batch_size, learning.sequence_length)
     random = np.random.default_rng(0)
-    return Batch(
+    return Records(
         image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
         action=np.zeros((*shape, agent.action_size), np.float32),
         reward=np.zeros(shape, np.float32),
@@ -251,7 +253,8 @@ def estimate(run: PlannedRun, speed: Speed) -> Estimate:
 
 
 def in_memory(spec: RunSpec) -> RunSpec:
-    """The spec with its updates in chunks, where the device's memory is short for all at once."""
+    """The spec with its updates in chunks, where the device's memory is short for all at once (and
+    for the replay, if that lies there too)."""
     device = jax.local_devices()[0]
     limit = (device.memory_stats() or {}).get("bytes_limit")
     if limit is None or _chunk(spec) == 1:
@@ -259,7 +262,11 @@ def in_memory(spec: RunSpec) -> RunSpec:
     alone = dataclasses.replace(spec, seeds=spec.seeds[:1])
     update, *_ = _compiled_update(make_agent(alone))
     update_bytes = max(1, update.memory_analysis().temp_size_in_bytes)
-    fits = int(MEMORY_SHARE * limit - _memory(spec, update_bytes, 0)) // update_bytes
+    taken = _memory(spec, update_bytes, 0)
+    sizes = len(spec.tasks), len(spec.members)
+    if on_device(make_agent(spec), any(x.has_host for x in envs.specs(spec.tasks)), *sizes)[0]:
+        taken += replay_bytes(make_agent(spec), *sizes)
+    fits = int(MEMORY_SHARE * limit - taken) // update_bytes
     if fits >= _chunk(spec):
         return spec
     schedule = dataclasses.replace(
@@ -281,6 +288,7 @@ def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
+        state += f", {len(run.failed)} failed" if run.failed else ""
         tasks = "-" if run.spec is None else " + ".join(run.spec.tasks)
         needs = ", ".join(numbers.get(name, name) for name in run.needs) or "-"
         row = [f"{numbers[run.name]:>2}  {run.name}", str(len(run.cells)), tasks, needs, state]
