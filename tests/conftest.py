@@ -32,7 +32,7 @@ LONGEST = (
     "test_golden",
     "test_package",
 )
-"""Files that take a worker longest. They come first, so that none is begun when the rest is done."""
+"""Files that take a worker longest come first, so that none is begun when the rest is done."""
 
 
 def pytest_collection_modifyitems(items):
