@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_jax.logs import read_metrics
-from experiments.__main__ import main
+from experiments.cli.main import main
 
 pytest.importorskip("pybullet")
 
