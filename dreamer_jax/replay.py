@@ -7,7 +7,8 @@ changed once written, so a run is resumed by cutting every stream back to the le
 checkpoint names. The oldest may be deleted: their disk space is given back, while files keep
 their lengths and later records their places. Files are read through memory maps: the page cache
 holds what was read last and gives it back under pressure, so the process does not grow with the
-replay.
+replay. Every append has a checksum (see `dreamer_jax.stream_checksums`); what this process has not
+written itself is compared with it when it is first read.
 
 Axis letters: P population member, K task, T steps in a phase, B batch, L sequence length,
 A action. Images are uint8 [height, width, 3] with height = width = `image_size`.
@@ -24,11 +25,19 @@ from pathlib import Path
 
 import numpy as np
 
-from dreamer_jax.files import explained, read_json, write_json_atomically
+from dreamer_jax.files import explained
 from dreamer_jax.holes import free_beginning
+from dreamer_jax.integrity import (
+    DamagedError,
+    read_sealed_json,
+    sync_all,
+    sync_files,
+    write_sealed_json,
+)
 from dreamer_jax.prefetch import Prefetcher
 from dreamer_jax.records import Records
 from dreamer_jax.sampling import sample_indices
+from dreamer_jax.stream_checksums import StreamChecksums
 
 _HEADER = "replay.json"
 _DELETED = "deleted.json"
@@ -94,13 +103,19 @@ class Replay:
         self.dtype = record_dtype(image_size, action_size)
         self._open(layout)
         self._lengths = self._stored_lengths()
+        self._checksums = {
+            stream: StreamChecksums(self.path(*stream), self.dtype.itemsize)
+            for stream in self._streams()
+        }
+        self._unsynced: set[tuple[int, int]] = set()
+        self._folder_synced = False
         self._deleted = self._stored_deleted()
 
     def _open(self, layout: Mapping[str, int]) -> None:
         header = self.directory / _HEADER
         expected = {"format": _FORMAT, **layout}
         if header.exists():
-            stored = read_json(header)
+            stored = read_sealed_json(header)
             differences = [
                 f"{name} {stored.get(name)} (expected {value})"
                 for name, value in expected.items()
@@ -119,7 +134,7 @@ class Replay:
                 for task in range(self.tasks):
                     self.path(member, task).touch()
             # Written last: a folder with a header is complete.
-            write_json_atomically(header, expected)
+            write_sealed_json(header, expected)
         except OSError as error:
             raise explained(
                 error, f"could not make the replay folder {self.directory}", self.directory
@@ -159,13 +174,13 @@ class Replay:
         path = self.directory / _DELETED
         if not path.exists():
             return np.zeros_like(self._lengths)
-        return np.array(read_json(path)["deleted"], np.int64)
+        return np.array(read_sealed_json(path)["deleted"], np.int64)
 
     def _set_deleted(self, deleted: np.ndarray) -> None:
         if (deleted != self._deleted).any():
             path = self.directory / _DELETED
             try:
-                write_json_atomically(path, {"deleted": deleted.tolist()})
+                write_sealed_json(path, {"deleted": deleted.tolist()})
             except OSError as error:
                 raise explained(error, f"could not write {path}", path) from error
             self._deleted = deleted
@@ -194,13 +209,18 @@ class Replay:
                 with open(path, "r+b") as file:
                     file.seek(int(self._lengths[stream]) * self.dtype.itemsize)
                     _write(file, rows)
+                checksums = self._checksums[stream]
+                if checksums.end != self._lengths[stream]:
+                    checksums.truncate(int(self._lengths[stream]))
+                checksums.append(rows.data, steps)
+                self._unsynced.add(stream)
         except OSError as error:
             self._roll_back()
             raise explained(
                 error,
                 f"could not append {steps} records to {path}",
                 path,
-                "every stream still holds what was committed before: make room and resume",
+                "every stream still holds what was committed before",
             ) from error
         except BaseException:
             self._roll_back()
@@ -232,16 +252,34 @@ class Replay:
             path = self.path(*stream)
             if path.stat().st_size > size:
                 os.truncate(path, size)
+            self._checksums[stream].truncate(int(self._lengths[stream]))
 
-    def truncate(self, lengths: np.ndarray) -> None:
-        """Cut every stream back to the lengths that a checkpoint committed.
+    def checksums(self) -> list[list[int]]:
+        """CRC-32 of every stream up to its committed length, [P, K], for a checkpoint to commit."""
+        return [
+            [self._checksums[member, task].checksum for task in range(self.tasks)]
+            for member in range(self.members)
+        ]
+
+    def sync(self) -> None:
+        """Wait until all committed records are on the disk, so that no loss of power takes them."""
+        if not self._folder_synced:
+            sync_all(self.directory)
+            self._folder_synced = True
+        else:
+            for stream in self._unsynced:
+                sync_files([self.path(*stream), self._checksums[stream].path])
+        self._unsynced.clear()
+
+    def check(self, lengths: np.ndarray, checksums: Sequence[Sequence[int]] | None = None) -> None:
+        """Whether the streams can be cut back to what a checkpoint committed.
 
         Args:
             lengths: integers [P, K].
+            checksums: of the streams at these lengths; None of a checkpoint that has none.
 
         Raises:
-            ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
-                that would be sampled at these lengths are deleted; nothing is cut then.
+            ValueError: see `truncate`; a `DamagedError` if the streams' checksums are others.
         """
         lengths = np.asarray(lengths, np.int64)
         if lengths.shape != self._lengths.shape:
@@ -252,7 +290,7 @@ class Replay:
         stored = self._stored_lengths()
         for stream in self._streams():
             if not 0 <= lengths[stream] <= stored[stream]:
-                raise ValueError(
+                raise DamagedError(
                     f"{self.path(*stream)} holds {stored[stream]} records, "
                     f"{lengths[stream]} were to be kept: the file does not belong to this "
                     "checkpoint or has lost data; resume from an older checkpoint"
@@ -264,9 +302,40 @@ class Replay:
                     f"deleted, those from {needed} on were to be kept: resume from a newer "
                     "checkpoint, or with as many records kept as before"
                 )
+            if checksums is not None:
+                member, task = stream
+                checksum = checksums[member][task]
+                self._checksums[stream].check_end(int(lengths[stream]), checksum)
+
+    def truncate(self, lengths: np.ndarray) -> None:
+        """Cut every stream back to the lengths that a checkpoint committed.
+
+        Args:
+            lengths: integers [P, K].
+
+        Raises:
+            ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
+                that would be sampled at these lengths are deleted; nothing is cut then.
+        """
+        self.check(lengths)
+        lengths = np.asarray(lengths, np.int64)
         self._lengths = lengths.copy()
         self._cut()
         self._set_deleted(np.minimum(self._deleted, lengths))
+
+    def verify(self, member: int, task: int, length: int) -> tuple[str | None, int]:
+        """Compares the first `length` records of a stream, but for deleted ones, with checksums.
+
+        Returns:
+            What is wrong, if anything; and how many of the records have no checksum.
+        """
+        checksums, deleted = self._checksums[member, task], int(self._deleted[member, task])
+        try:
+            for number in checksums.overlapping(deleted, length):
+                checksums.check(number)
+        except (DamagedError, OSError) as error:
+            return str(error), 0
+        return None, checksums.unchecked(deleted, length)
 
     def _oldest_sampled(self, lengths: np.ndarray) -> np.ndarray:
         """Which records are the first that are sampled at these lengths: int64 [P, K]."""
@@ -292,6 +361,7 @@ class Replay:
         self._set_deleted(deleted)
         for stream in streams:
             path = self.path(*stream)
+            self._checksums[stream].split(int(deleted[stream]))
             try:
                 free_beginning(path, int(deleted[stream]) * self.dtype.itemsize)
             except OSError as error:
@@ -320,6 +390,7 @@ class Replay:
             )
         records = self._empty((stop - start,))
         if stop > start:
+            self._checksums[member, task].check_records(start, stop)
             stream = self._map(member, task)
             for name, values in records._asdict().items():
                 values[:] = stream[name][start:stop]
@@ -381,6 +452,7 @@ class Replay:
             for task in np.unique(tasks):
                 stream = self._map(member, task)
                 for row in np.flatnonzero(tasks == task):
+                    self._checksums[member, task].check_records(starts[row], starts[row] + length)
                     sequence = stream[starts[row] : starts[row] + length]
                     for name, values in fields.items():
                         values[position, row] = sequence[name]

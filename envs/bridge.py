@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental import io_callback
 
 from envs.base import SimulatorError, TaskSpec, TimeStep
-from envs.pool import SimulatorPool
+from envs.pool import SIMULATOR_TIMEOUT, SimulatorPool
 from envs.rows import action_words, check_slots, key_words, mapped_rows
 
 
@@ -100,6 +100,7 @@ class HostEnv:
         action_repeat: environment steps for which an action is held.
         action_size: A, at least the largest |A| of the tasks.
         workers: number of worker processes, by default min(cores, slots).
+        timeout: seconds after which a simulator that does not answer is given up.
     """
 
     def __init__(
@@ -110,6 +111,7 @@ class HostEnv:
         action_repeat: int,
         action_size: int,
         workers: int | None = None,
+        timeout: float = SIMULATOR_TIMEOUT,
     ):
         self.tasks = tuple(tasks)
         self.members = members
@@ -121,7 +123,7 @@ class HostEnv:
         self._ticks = np.full(members * len(self.tasks), -1, np.int32)
         self._resting = np.zeros(members * len(self.tasks), bool)
         self._pool = SimulatorPool(
-            self.tasks * members, image_size, action_size, action_repeat, workers
+            self.tasks * members, image_size, action_size, action_repeat, workers, timeout
         )
         results = (
             jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
@@ -167,8 +169,13 @@ class HostEnv:
         """
         self._calls.check()
 
+    def hurry(self) -> None:
+        """Wait no longer than a few seconds for simulators from now on: the run is to stop."""
+        self._pool.hurry()
+
     def close(self) -> None:
         """End the worker processes."""
+        self.hurry()
         jax.effects_barrier()
         self._pool.close()
 

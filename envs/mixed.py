@@ -85,6 +85,11 @@ class MixedEnv:
         if errors:
             raise errors[0]
 
+    def hurry(self) -> None:
+        """Wait no longer than a few seconds for simulators from now on."""
+        for part in self.parts:
+            part.hurry()
+
     def close(self) -> None:
         """Close every environment."""
         for part in self.parts:

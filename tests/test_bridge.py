@@ -426,7 +426,7 @@ def test_a_simulator_that_cannot_be_imported_is_an_error_and_leaves_nothing_open
     gc.collect()  # of what earlier tests left
     files = len(list(Path("/proc/self/fd").iterdir()))
     for _ in range(3):
-        with pytest.raises(AttributeError, match="no attribute 'Missing'"):
+        with pytest.raises(SimulatorError, match="slot 0, fake/missing, .*no attribute 'Missing'"):
             HostEnv([fake("Missing")], 2, 4, 1, 2, workers=2)
     gc.collect()
     assert len(list(Path("/proc/self/fd").iterdir())) <= files

@@ -35,7 +35,9 @@ def make_agent(spec: RunSpec) -> Agent:
     return dataclasses.replace(agent, config=dataclasses.replace(spec.config, learning=learning))
 
 
-def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
+def make_env(
+    spec: RunSpec, workers: int | None = None, timeout: float = envs.SIMULATOR_TIMEOUT
+) -> envs.Env:
     """The simulators of a run: one for every member and task."""
     return envs.make(
         spec.tasks,
@@ -44,6 +46,7 @@ def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
         action_repeat=spec.config.schedule.action_repeat,
         workers=workers,
         supersample=spec.config.schedule.supersample,
+        timeout=timeout,
     )
 
 

@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.randomness import EVALUATION_PHASES
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import Episode, collect, episodes
 from dreamer_jax.video import tile, write_video
+from dreamer_jax.waiting import to_host
 from experiments.runs.agents import load_params, make_agent, make_env
 from experiments.runs.spec import RunSpec, read_spec
 
@@ -55,6 +57,7 @@ def evaluate(
     *,
     video: bool = False,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     report: Callable[[int, float], Any] = lambda done, score: None,
 ) -> list[dict[str, Any]]:
     """Plays episodes with every member of a run: the mode, without noise, up to the first fall.
@@ -64,6 +67,7 @@ def evaluate(
       count: episodes per member and task.
       video: whether to write videos/evaluate_TASK.mp4 and videos/prediction_TASK.mp4.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
       report: called after each episode with how many are done and their mean return.
 
     Returns:
@@ -71,7 +75,7 @@ def evaluate(
       fell.
     """
     directory, spec, params = agents
-    agent, env = make_agent(spec), make_env(spec, workers)
+    agent, env = make_agent(spec), make_env(spec, workers, timeout)
     rows = []
     try:
         for number in range(count):
@@ -118,7 +122,7 @@ def _played(agent: Agent, env, agents: Agents, number: int) -> Records:
         ticks=spec.config.schedule.phase_ticks,
         mode="evaluate",
     )
-    records = records.map(np.asarray)
+    records = to_host(records)
     env.check()
     return records
 

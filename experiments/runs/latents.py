@@ -21,6 +21,7 @@ from dreamer_jax.agent import Agent
 from dreamer_jax.randomness import LATENT_PHASES
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
+from dreamer_jax.waiting import to_host
 from experiments.runs.agents import Source, make_agent
 
 Features = Literal["sample", "mean", "first"]
@@ -133,7 +134,7 @@ def gather(
                 ticks=source.spec.config.schedule.phase_ticks,
                 mode="random" if policy == "random" else "evaluate",
             )
-            records = records.map(lambda x: np.asarray(x)[0])
+            records = to_host(records).at(0)
             env.check()
             missing = agent.action_size - acting.action_size
             action = np.pad(records.action, ((0, 0), (0, 0), (0, missing)))
