@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections import deque
-from typing import TextIO
+from typing import TextIO, cast
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -54,7 +54,7 @@ class Progress:
         self._phase = ""
         self._last_return: float | None = None
         self._interval = interval
-        self._console = Console(file=SafeStream(stream or sys.stdout))
+        self._console = Console(file=cast(TextIO, SafeStream(stream or sys.stdout)))
         self._live: Live | None = None
         self._printed = -math.inf
         self._history = deque([(time.monotonic(), self._share())], maxlen=_WINDOW)

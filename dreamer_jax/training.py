@@ -251,7 +251,7 @@ class Run:
                     self.save()
                     if not stop.requested:
                         raise
-                    self._bar.message(f"this phase is given up: {error}")
+                    self._bar.message(f"this phase is given up: {error}")  # type: ignore[unreachable]
                     return "stopped"
             self.save()
         return "finished" if action == "done" else "stopped"
@@ -335,9 +335,10 @@ class Run:
         self._bar.update(phase="updating")
         learning, schedule = self.agent.config.learning, self.schedule.config
         due = self.schedule.updates_due(self.counters.rounds)
-        started, before, loss = time.perf_counter(), self.counters.updates, None
+        started, before = time.perf_counter(), self.counters.updates
+        loss: jax.Array | None = None
         with self.replay.batches(
-            np.asarray(self.seeds),
+            np.asarray(self.seeds).tolist(),
             range(before, due),
             learning.batch_size,
             learning.sequence_length,
@@ -353,20 +354,19 @@ class Run:
                     chunk=schedule.mapping_chunk,
                 )
                 # One update ahead of the device, no more: the next batch is being prepared.
-                if previous is not None:
-                    previous.block_until_ready()
+                jax.block_until_ready(previous)
                 self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
                 self._bar.update(updates=update + 1)
                 if stop.requested:
                     break
-        loss.block_until_ready()
+        jax.block_until_ready(loss)
         self._time("update", started, updates=self.counters.updates - before)
         if self.counters.updates == due:
             self._write_averages()
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
-        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy))
+        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy)).tolist()
         self._healthy = np.array(self.state.healthy)
         for member in range(len(self.members)):
             averages = {name: float(x[member]) / count for name, x in sums.items()}
