@@ -95,6 +95,11 @@ def _main(arguments: list[str], program: str) -> int:
         return FAILURE
 
 
+def console() -> int:
+    """The command `dreamer-transfer`."""
+    return main(program="dreamer-transfer")
+
+
 def _is_told(error: Exception) -> bool:
     """Whether an error's message says all that a user needs."""
     if isinstance(error, OSError | ModuleNotFoundError):

@@ -51,6 +51,8 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
@@ -170,6 +172,8 @@ class Classify:
     or each image as if it were the first of an episode."""
     seed: int = setting(0, 0, 2**31 - 1)
     """Of episodes, actions and samples."""
+    accept_failed: bool = False
+    """Take agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
 
@@ -214,14 +218,17 @@ def train(command: Train) -> int:
     with usage_errors():
         method = make_method(command.method, command.transfer)
         spec = RunSpec(run.task, run.seeds, command.config, method)
+    from dreamer_jax.host_memory import keep_freed_memory
     from experiments.runs.run import carry_out, make_run
 
+    keep_freed_memory()
     with usage_errors():
         begun = make_run(
             spec,
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.workers,
+            accept_failed=run.accept_failed,
             timeout=run.simulator_timeout,
             from_checkpoint=run.from_checkpoint,
         )
@@ -343,8 +350,9 @@ def classify(command: Classify) -> int:
     }
     with usage_errors():
         classify.check_request(command.task, command.known, actors=command.actors, **request)
-        source = load_source(command.source, command.source_member)
-        actors = [load_source(directory) for directory in command.actors]
+        load = functools.partial(load_source, accept_failed=command.accept_failed)
+        source = load(command.source, command.source_member)
+        actors = [load(directory) for directory in command.actors]
         with Progress() as bar:
             total = classify.rounds(source, command.samples) * max(1, len(actors))
             job = bar.add_task("gathering samples", total=total)

@@ -4,6 +4,7 @@ What takes long to import is imported where it is used, so that bad input is tol
 """
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ class Sweep:
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     file: ConfigFile = None
     """A YAML or JSON file of settings (config, and perhaps seeds), written as a run's own are
     (run.json): over the preset's, under those given by name."""
@@ -195,11 +198,15 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     Raises:
       UsageError: results of other settings are there, or a simulator is not installed.
     """
-    from experiments.thesis.sweep import carry_out_runs
+    from dreamer_jax.host_memory import keep_freed_memory
+    from experiments.thesis.sweep import carry_out_runs, train
 
     runs = _planned(entries, sweep)
+    if any(run.state in ("missing", "cut") for run in runs):
+        keep_freed_memory()
+    trains = functools.partial(train, accept_failed=sweep.accept_failed)
     with usage_errors():
-        progress = carry_out_runs(runs, sweep.root, workers=sweep.workers)
+        progress = carry_out_runs(runs, sweep.root, workers=sweep.workers, train=trains)
     if progress.stopped:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
     return runs, progress
@@ -273,6 +280,7 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
                     entry,
                     sweep.seeds[0],
                     workers=sweep.workers,
+                    accept_failed=sweep.accept_failed,
                     report=lambda done, rounds, bar=bar, job=job: bar.update(
                         job, completed=done, total=rounds, visible=True
                     ),

@@ -16,6 +16,7 @@ import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from experiments.runs import exported
+from experiments.runs.folder import failed_members
 from experiments.runs.spec import RunSpec, action_size, read_spec
 
 
@@ -65,16 +66,20 @@ class Source:
     params: dict[str, Any]
 
 
-def load_source(name: str | Path, member: int = 0, base: str | Path = "") -> Source:
+def load_source(
+    name: str | Path, member: int = 0, base: str | Path = "", *, accept_failed: bool = False
+) -> Source:
     """A trained agent: one member of a run, from its newest checkpoint, or an exported one.
 
     Args:
       name: a results folder, a .safetensors file with its card, or "zoo:NAME".
       member: which of the run's population.
       base: the folder that relative paths start from; by default the working directory.
+      accept_failed: take a member that met losses that are not finite, as it was before.
 
     Raises:
-      ValueError: there is no run, no checkpoint, no such member, or no sound file.
+      ValueError: there is no run, no checkpoint, no such member, or no sound file; or the member
+        failed.
     """
     if exported.is_exported(name):
         if member:
@@ -88,8 +93,26 @@ def load_source(name: str | Path, member: int = 0, base: str | Path = "") -> Sou
     count = len(spec.members)
     if not 0 <= member < count:
         raise ValueError(f"{directory} has members 0 to {count - 1}, member {member} was asked for")
+    if not accept_failed:
+        check_sound(directory, member)
     params = load_params(directory)
     return Source(directory, spec, jax.tree.map(lambda x: x[member], params))
+
+
+def check_sound(directory: str | Path, member: int) -> None:
+    """Checks that a member of a run has not failed.
+
+    Raises:
+      ValueError: it has.
+    """
+    if member in failed_members(directory):
+        sound = sorted(set(range(len(read_spec(directory).members))) - failed_members(directory))
+        others = f"take member {', '.join(map(str, sound))}" if sound else "train it anew"
+        raise ValueError(
+            f"member {member} of {directory} failed: its losses were not finite any more, and it "
+            f"stayed as it was before. {others[0].upper()}{others[1:]}, or insist with "
+            "--accept-failed"
+        )
 
 
 def load_params(directory: str | Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json, write_json_atomically
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
-from experiments.runs.agents import load_params
+from experiments.runs.agents import check_sound, load_params
 from experiments.runs.evaluate import evaluate, load_agents
 from experiments.runs.exported import FORMAT, SUFFIX, Card, file_sha256
 from experiments.runs.spec import read_spec
@@ -41,7 +41,7 @@ def export(
 
     Raises:
       ValueError: the path ends otherwise; the folder holds no run, no checkpoint, no such member,
-        or parameters that are not finite.
+        one that failed, or parameters that are not finite.
       FileExistsError: there is such a file already.
     """
     directory, path = Path(directory), Path(path)
@@ -58,6 +58,7 @@ def export(
         raise ValueError(
             f"{directory} has members 0 to {len(members) - 1}, member {member} was asked for"
         )
+    check_sound(directory, member)
     params = jax.tree.map(lambda leaf: leaf[member], load_params(directory))
     for name, leaf in transfer.flatten(params).items():
         if not np.all(np.isfinite(leaf)):

@@ -6,6 +6,7 @@ and read there. A folder that cannot be read is warned of, and its cells count a
 """
 
 import contextlib
+import math
 import re
 import warnings
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
 from dreamer_jax.integrity import DamagedError, read_sealed_json
+from dreamer_jax.logs import read_metrics
 
 CELLS = "cells.json"
 
@@ -73,6 +75,20 @@ def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
         for member, name in enumerate(names):
             found.setdefault(name, (folder, member))
     return found
+
+
+def failed_members(folder: str | Path) -> frozenset[int]:
+    """The members of a run that met losses, gradients or returns that are not finite, by place.
+
+    Such a member was frozen as it was before; its rows say so from then on.
+    """
+    folder = Path(folder)
+    rows = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
+    return frozenset(
+        row["member"]
+        for row in rows
+        if not (row.get("healthy", True) and math.isfinite(row.get("return", 0.0)))
+    )
 
 
 def latents_folder(root: str | Path, backend: str, seed: int) -> Path:

@@ -62,6 +62,7 @@ def make_run(
     resume: bool = False,
     workers: int | None = None,
     base: str | Path = "",
+    accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
     from_checkpoint: int | None = None,
     lock: FolderLock | None = None,
@@ -75,6 +76,7 @@ def make_run(
       resume: continue what the folder holds.
       workers: simulator processes; by default one per core.
       base: the folder that the spec's relative paths start from; by default the working directory.
+      accept_failed: take sources that failed, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
       from_checkpoint: step of an older checkpoint to go on from.
       lock: the folder's lock, if the caller holds it; released with the run, or when this raises.
@@ -95,7 +97,8 @@ def make_run(
     try:
         state, report = None, None
         if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
-            state, report = transferred_members(spec, load_sources(spec, base), workers=workers)
+            sources = load_sources(spec, base, accept_failed=accept_failed)
+            state, report = transferred_members(spec, sources, workers=workers)
         agent = make_agent(spec)
         env = make_env(spec, workers=workers, timeout=timeout)
         lock = lock or FolderLock(directory)

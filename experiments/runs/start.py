@@ -17,20 +17,21 @@ from experiments.runs.latents import own_latents
 from experiments.runs.spec import RunSpec
 
 
-def load_sources(spec: RunSpec, base: str | Path = "") -> Sources:
+def load_sources(spec: RunSpec, base: str | Path = "", *, accept_failed: bool = False) -> Sources:
     """Reads the agents that a run needs, and checks that they fit it.
 
     Args:
       spec: of the run.
       base: the folder that the spec's relative paths start from; by default the working directory.
+      accept_failed: take members that failed, as they were before.
 
     Raises:
-      ValueError: a folder holds no run or no checkpoint; sizes differ; or the method cannot use a
-        source.
+      ValueError: a folder holds no run or no checkpoint; sizes differ; a member failed; or
+        the method cannot use a source.
     """
-    method = spec.method
-    agents = tuple(load_source(path, method.source_member, base) for path in method.sources)
-    stored = tuple(load_source(path, base=base) for path in method.stored)
+    method, load = spec.method, functools.partial(load_source, accept_failed=accept_failed)
+    agents = tuple(load(path, method.source_member, base) for path in method.sources)
+    stored = tuple(load(path, base=base) for path in method.stored)
     for one in (*agents, *stored):
         check_source(one, spec)
     sources = Sources(agents, stored)

@@ -282,6 +282,7 @@ def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
+        state += f", {len(run.failed)} failed" if run.failed else ""
         tasks = "-" if run.spec is None else " + ".join(run.spec.tasks)
         needs = ", ".join(numbers.get(name, name) for name in run.needs) or "-"
         row = [f"{numbers[run.name]:>2}  {run.name}", str(len(run.cells)), tasks, needs, state]

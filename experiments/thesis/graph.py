@@ -10,7 +10,7 @@ from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from dreamer_jax.config import Config, Difference
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Counters, Schedule
-from experiments.runs.folder import CELLS, begun, read_cells, run_folders
+from experiments.runs.folder import CELLS, begun, failed_members, read_cells, run_folders
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.thesis.grid import Cell
 from experiments.thesis.populations import (
@@ -38,6 +38,7 @@ class PlannedRun:
       state: "missing", "cut" (begun, and can be resumed), "done", or "corrupt".
       progress: share of its updates that is done.
       problem: what is wrong with a corrupt one.
+      failed: names of the cells whose agents met losses that are not finite.
     """
 
     name: str
@@ -47,6 +48,7 @@ class PlannedRun:
     state: Literal["missing", "cut", "done", "corrupt"] = "missing"
     progress: float = 0.0
     problem: str = ""
+    failed: tuple[str, ...] = ()
 
 
 def changed_settings(root: str | Path) -> tuple[Difference, ...]:
@@ -179,20 +181,29 @@ def _inspect(folder: Path) -> PlannedRun:
             raise ValueError(f"{folder} has {len(spec.members)} agents and names {len(cells)}")
         schedule = Schedule(spec.config.schedule, len(spec.tasks))
         evaluations = _evaluations(folder)
+        failed = tuple(cells[member] for member in sorted(failed_members(folder)))
         checkpoints = Checkpointer(folder / "checkpoints")
         if checkpoints.latest() is None:
             # Copied without checkpoints: what is evaluated to the end is done, for tables.
             done = evaluations >= schedule.evaluations
             needs = () if done else spec.method.needs
             return PlannedRun(
-                folder.name, cells, spec, needs, "done" if done else "cut", float(done)
+                folder.name,
+                cells,
+                spec,
+                needs,
+                "done" if done else "cut",
+                float(done),
+                failed=failed,
             )
         counters = Counters(**checkpoints.metadata(checkpoints.latest())["counters"])
-    except (ValueError, KeyError, TypeError, CorruptCheckpointError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, CorruptCheckpointError) as error:
         return _corrupt(folder, cells, error)
     done = schedule.next(counters) == "done"
     progress = counters.updates / max(1, schedule.updates)
-    return PlannedRun(folder.name, cells, spec, (), "done" if done else "cut", progress)
+    return PlannedRun(
+        folder.name, cells, spec, (), "done" if done else "cut", progress, failed=failed
+    )
 
 
 def _evaluations(folder: Path) -> int:

@@ -36,6 +36,7 @@ def make_table(
     seed: int,
     *,
     workers: int | None = None,
+    accept_failed: bool = False,
     say: Callable[[str], Any] = print,
     report: Callable[[int, int], Any] = lambda done, rounds: None,
 ) -> Path:
@@ -46,6 +47,7 @@ def make_table(
       table: of the kind "ltc".
       seed: of the agent, and of episodes and samples.
       workers: simulator processes; by default one per core.
+      accept_failed: take an agent whose losses were not finite any more, as it was before.
       say: where messages go.
       report: called after each round of gathering, with how many are done and how many there are.
 
@@ -53,7 +55,7 @@ def make_table(
       The file of accuracies, which `reports.outcomes.read_classification` reads.
 
     Raises:
-      ValueError: the agent is not trained, or its samples are damaged.
+      ValueError: the agent is not trained or failed, or its samples are damaged.
     """
     folder = latents_folder(root, table.backend, seed)
     path = folder / f"{table.name}.json"
@@ -62,7 +64,9 @@ def make_table(
     names = {title: task_name(table.backend, title) for title in TASKS}
     if not (folder / "samples.npz").exists():
         say(f"latent states of {len(names)} tasks: {folder}")
-        drawn = _gather(root, table.backend, tuple(names.values()), seed, workers, report)
+        drawn = _gather(
+            root, table.backend, tuple(names.values()), seed, workers, accept_failed, report
+        )
         _write(folder / "samples.npz", drawn)
     drawn = _read(folder / "samples.npz", tuple(names.values()))
     tasks = tuple(names[title] for title in (*table.targets, *table.known))
@@ -80,13 +84,14 @@ def _gather(
     tasks: tuple[str, ...],
     seed: int,
     workers: int | None,
+    accept_failed: bool,
     report: Callable[[int, int], Any],
 ) -> dict[str, tuple[Latents, Latents]]:
     cell = multitask(backend, AUTOENCODER, seed)
     places = folders(root)
     if cell.name not in places:
         raise ValueError(f"the agent {cell.name!r} is not trained yet: its table trains it first")
-    source = load_source(*places[cell.name])
+    source = load_source(*places[cell.name], accept_failed=accept_failed)
     rounds, done = classify.rounds(source, SAMPLES), itertools.count(1)
     found = gather(
         source,

@@ -49,7 +49,9 @@ class Progress:
 Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
 
 
-def train(run: PlannedRun, root: Path, workers: int | None) -> Literal["finished", "stopped"]:
+def train(
+    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
+) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
     Raises:
@@ -65,6 +67,7 @@ def train(run: PlannedRun, root: Path, workers: int | None) -> Literal["finished
         spec = in_memory(spec)
     try:
         options = {"workers": workers, "base": root, "lock": lock, "cells": run.cells}
+        options["accept_failed"] = accept_failed
         return carry_out(make_run(spec, folder, resume=True, **options))
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
