@@ -64,13 +64,13 @@ class StopRequest:
     A context manager; outside the main thread it does nothing, as Python allows no more.
 
     Args:
-      notify: is told of the request in words.
+      say: is told of the request in words.
       hurry: called at the request, so that nothing that hangs is waited for.
     """
 
-    def __init__(self, notify: Callable[[str], None], hurry: Callable[[], None]):
+    def __init__(self, say: Callable[[str], None], hurry: Callable[[], None]):
         self.requested = False
-        self._notify, self._hurry = notify, hurry
+        self._say, self._hurry = say, hurry
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -89,7 +89,7 @@ class StopRequest:
             raise KeyboardInterrupt
         self.requested = True
         self._hurry()
-        self._notify("stopping: saving first (once more to quit without)")
+        self._say("stopping: saving first (once more to quit without)")
 
 
 def _mean(values: Sequence[float]) -> float:
