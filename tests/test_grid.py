@@ -80,10 +80,3 @@ def test_on_another_backend_no_agent_is_shared():
         for backend in ("bullet", "brax")
     )
     assert len(here) == len(there) and not here & there
-
-
-def test_the_demo_is_a_part_of_table_7():
-    part, whole = (cells_of([entry], seeds=(0, 1)) for entry in (grid.DEMO, TABLES["table-7"]))
-    assert set(part) < set(whole)
-    # A source, three fractions of two seeds, and two baselines.
-    assert len(part) == 1 + 6 + 2

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_jax.files import read_json
-from experiments.reports.page import STYLE
+from experiments.reports import page
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
 from experiments.thesis.published import PATH, classification, records, returns
@@ -186,8 +186,7 @@ def test_the_bound_on_deviations_of_three_holds_and_is_reached():
     assert deviation == pytest.approx(math.sqrt(2) * (1 - mean))
 
 
-def test_the_demo_stands_beside_the_table_that_it_is_a_part_of():
-    assert published.number(grid.DEMO) == 7
+def test_a_table_stands_beside_the_one_of_its_name():
     assert published.number(grid.on_backend(grid.TABLES["table-12"], "brax")) == 12
     strange = dataclasses.replace(grid.TABLES["table-1"], name="table-18")
     with pytest.raises(ValueError, match="the thesis has no table-18, its tables are table-1, "):
@@ -206,10 +205,14 @@ def test_each_contradiction_says_what_where_and_what_is_done():
         assert place.lower() in text.lower()
 
 
-@pytest.mark.parametrize("path", [PATH, STYLE])
+READ = (PATH, *(Path(page.__file__).with_name(name) for name in ("page.css", "page.html.j2")))
+
+
+@pytest.mark.parametrize("path", READ)
 def test_what_the_report_reads_is_packaged(path):
     root = Path(__file__).parent.parent
     settings = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]
     package = ".".join(path.parent.relative_to(root).parts)
-    patterns = settings["package-data"][package]
+    data = settings["package-data"]
+    patterns = [*data["*"], *data.get(package, [])]
     assert path.exists() and any(fnmatch(path.name, pattern) for pattern in patterns)
