@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer_jax.agent import Agent, Mode
+from dreamer_jax.device_round import DeviceRounds, on_device
 from dreamer_jax.diagnosis import diagnose, warnings
 from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
@@ -162,6 +163,9 @@ class Run:
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
+        self._one_program, self._replay_note = on_device(
+            agent, getattr(env, "has_host", True), len(self.tasks), len(self.members)
+        )
         self.videos = videos
         self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
         self.folder = RunFolder(
@@ -187,6 +191,10 @@ class Run:
     def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
         """Takes up what the folder holds, or else the state given, or else fresh agents."""
         agent = self.agent
+        # Where rounds are one program each; None where updates read the files.
+        self.device_rounds = (
+            DeviceRounds(agent, self.env, self.replay, self.seeds) if self._one_program else None
+        )
         self.counters = Counters()
         self.state = init_members(agent, self.seeds) if state is None else state
         if self.state.updates.shape != (len(self.members),):
@@ -228,6 +236,8 @@ class Run:
             self._progress_bar() as self._bar,
             StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
+            if self._replay_note:
+                self._bar.message(self._replay_note)
             if self.checkpoints.latest() is None:
                 self.save()
             saved_steps = schedule.environment_steps(self.counters.rounds)
@@ -243,7 +253,7 @@ class Run:
                     elif action == "evaluate":
                         self._evaluate()
                     else:
-                        self._collect("random" if action == "prefill" else "explore")
+                        self._round("random" if action == "prefill" else "explore")
                 except (KeyboardInterrupt, NonFiniteError):
                     raise
                 except Exception as error:
@@ -306,10 +316,37 @@ class Run:
         self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
-    def _collect(self, mode: Literal["random", "explore"]) -> None:
+    def _round(self, mode: Literal["random", "explore"]) -> None:
+        """Collects, and in one program with that makes the updates that are then due, if rounds
+        are one program each."""
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
+        if self.device_rounds is None:
+            self._commit(self._phase(mode, self.counters.rounds), mode)
+            return
+        started, rounds = time.perf_counter(), self.counters.rounds
+        updates = range(self.counters.updates, self.schedule.updates_due(rounds + 1))
+        try:
+            self.state, self.sums, records = self.device_rounds.run(
+                self.state, self.sums, rounds, updates, mode
+            )
+            self.env.check()
+            check_records(records, self.tasks)
+            self._time("round", started, updates=len(updates))
+            self._commit(records, mode)
+        except Exception:
+            # The agents from before the round are used up.
+            self.device_rounds.forget()
+            self._restore()
+            raise
+        if updates:
+            averaged = self.counters.averaged + len(updates)
+            self._advance(updates=updates.stop, averaged=averaged)
+            self._bar.update(updates=updates.stop)
+            self._write_averages()
+
+    def _commit(self, records: Records, mode: Literal["random", "explore"]) -> None:
+        """Writes a phase to the replay, and what it brought to the metrics."""
         rounds = self.counters.rounds
-        records = self._phase(mode, rounds)
         self.replay.append(records)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
