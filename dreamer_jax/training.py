@@ -203,12 +203,16 @@ class Run:
             )
         learning = agent.config.learning
         self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
-        found = self.folder.restore({"agent": self.state, "sums": self.sums}, from_checkpoint)
+        self._restore(from_checkpoint)
+        self._warned: set[tuple[int, str]] = set()
+
+    def _restore(self, step: int | None = None) -> None:
+        """Goes back to a checkpoint, by default the newest, if there is one."""
+        found = self.folder.restore({"agent": self.state, "sums": self.sums}, step)
         if found is not None:
             self.state, self.sums = found[0]["agent"], found[0]["sums"]
             self.counters = Counters(**found[1])
         self._healthy = np.array(self.state.healthy)
-        self._warned: set[tuple[int, str]] = set()
 
     def save(self) -> None:
         """Writes a checkpoint of everything that a resumed run needs."""
