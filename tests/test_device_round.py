@@ -248,7 +248,7 @@ def test_a_replay_of_other_phases_is_refused(tmp_path):
     record = np.zeros((1, 1, 7), bool)
     zeros = np.zeros((1, 1, 7), np.float32)
     images = np.zeros((1, 1, 7, 4, 4, 3), np.uint8)
-    files.append(Records(images, zeros[..., None], zeros, record, record)._asdict())
+    files.append(Records(images, zeros[..., None], zeros, record, record))
     with pytest.raises(ValueError, match=r"hold \[\[7\]\] records, no whole number of phases of 5"):
         device_replay.filled(files, 10, 5)
 
