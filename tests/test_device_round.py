@@ -231,7 +231,7 @@ def test_a_full_replay_forgets_its_oldest_phase_and_reads_across_its_end(tmp_pat
             first=random.random((2, 2, 5)) < 0.5,
             terminal=random.random((2, 2, 5)) < 0.5,
         )
-        files.append(records._asdict())
+        files.append(records)
         held = device_replay.write(held, records, jnp.int32(phase))
     chex.assert_trees_all_equal(held, device_replay.filled(files, 15, 5))
     # Records 10 to 24 are held, number 15 in the first place.
@@ -239,8 +239,7 @@ def test_a_full_replay_forgets_its_oldest_phase_and_reads_across_its_end(tmp_pat
     batch = device_replay.read(held, tasks, starts % 15, 4)
     for p, b in np.ndindex(2, 2):
         expected = files.read(p, tasks[p, b], starts[p, b], starts[p, b] + 4)
-        for name, values in expected.items():
-            np.testing.assert_array_equal(getattr(batch, name)[p, b], values)
+        chex.assert_trees_all_equal(batch.at(p, b), expected)
 
 
 def test_a_replay_of_other_phases_is_refused(tmp_path):
