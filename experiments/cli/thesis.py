@@ -260,15 +260,13 @@ def _speed(runs, again: bool = False):
     due = [run.spec for run in runs if run.state in DUE]
     if not due:
         return None
-    told: list[str] = []
 
-    def tell(what: str) -> None:
-        if not told:
+    def report(number: int, count: int, what: str) -> None:
+        if number == 1:
             print("measuring how fast this machine is:", file=sys.stderr)
-        told.append(what)
-        print(f"  {what}", file=sys.stderr, flush=True)
+        print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
 
-    return speed_of(due, cache_folder(), again=again, tell=tell)
+    return speed_of(due, cache_folder(), again=again, report=report)
 
 
 def _may_begin(runs) -> bool:
