@@ -104,7 +104,8 @@ class Demo:
 def _sweep(base: Base) -> Sweep:
     """The defaults of a sweep."""
     if strange := sorted(set(base.values) - {"preset", "seeds", "config"}):
-        raise ValueError(f"{base.file}: the settings {', '.join(strange)} are those of a table")
+        told = ", ".join(strange)
+        raise ValueError(f"{base.file}: the settings {told} are not those of a table")
     seeds = sequence(base.values, "seeds", grid.SEEDS)
     return Sweep(preset=base.preset, file=base.file, seeds=seeds, config=base.config)
 
