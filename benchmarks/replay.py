@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 
 DEFAULTS = {
@@ -51,15 +52,15 @@ def fill(replay: Replay, records: int) -> int:
     for start in range(0, records, PHASE):
         shape = (replay.members, replay.tasks, min(PHASE, records - start))
         replay.append(
-            {
-                "image": np.frombuffer(random.bytes(int(np.prod(shape + image))), np.uint8).reshape(
+            Records(
+                image=np.frombuffer(random.bytes(int(np.prod(shape + image))), np.uint8).reshape(
                     shape + image
                 ),
-                "action": random.random((*shape, *action), np.float32),
-                "reward": random.random(shape, np.float32),
-                "first": np.zeros(shape, bool),
-                "terminal": np.zeros(shape, bool),
-            }
+                action=random.random((*shape, *action), np.float32),
+                reward=random.random(shape, np.float32),
+                first=np.zeros(shape, bool),
+                terminal=np.zeros(shape, bool),
+            )
         )
         largest = max(largest, anonymous_bytes())
     return largest

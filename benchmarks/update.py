@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config, LearningConfig, NetworkConfig, preset
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.records import Records
 
 SIZES = {
     "depth": 32,
@@ -75,7 +76,7 @@ def prepare(a):
     agent = Agent(settings(a), a["A"])
     random = np.random.default_rng(0)
     shape = (a["P"], a["B"], a["L"])
-    batch = Batch(
+    batch = Records(
         image=random.integers(0, 256, (*shape, a["image"], a["image"], 3), dtype=np.uint8),
         action=random.uniform(-1, 1, (*shape, a["A"])).astype(np.float32),
         reward=random.normal(size=shape).astype(np.float32),

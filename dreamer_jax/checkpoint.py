@@ -1,8 +1,9 @@
 """Checkpoints of a whole run: any pytree of arrays and a JSON object, bit for bit.
 
-A checkpoint is a folder `step_000000001000/` with a stored tree (see `dreamer_jax.stored_tree`) and
-`metadata.json`. It is written under a temporary name and renamed when complete, so a folder of that
-name is whole unless the disk damaged it, which its checksums tell.
+A checkpoint is a folder `step_000000001000/` with a stored tree (see `dreamer_jax.stored_tree`),
+`metadata.json`, and `checksums.json` of all its files. It is written under a temporary name and
+renamed when all of it is on the disk, so a folder of that name is whole unless the disk damaged it,
+which its checksums tell before anything else is read.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dreamer_jax.files import explained, write_json_atomically
+from dreamer_jax.files import explained, sync_folder, write_json_atomically
+from dreamer_jax.integrity import CHECKSUMS, check_files, sync_all, write_checksums
 from dreamer_jax.stored_tree import (
     CorruptCheckpointError,
     Tree,
@@ -31,6 +33,7 @@ __all__ = ["Checkpointer", "CorruptCheckpointError", "load_tree"]
 
 _STEP = re.compile(r"step_(\d{12})$")
 _TEMPORARY = ".tmp"
+_SEALED = "has_checksums"  # in the metadata, so that checksums that are gone are missed
 
 
 class Checkpointer:
@@ -84,16 +87,21 @@ class Checkpointer:
             self._clean()
             temporary.mkdir(parents=True)
             write_tree(temporary, state)
-            write_json_atomically(temporary / "metadata.json", _plain(metadata))
+            stored = {**_plain(metadata), _SEALED: True}
+            write_json_atomically(temporary / "metadata.json", stored)
+            write_checksums(temporary)
+            sync_all(temporary)
             replaced = [_retired(self.path(later)) for later in self.steps() if later >= step]
             os.replace(temporary, target)
+            sync_folder(self.directory)
         except OSError as error:
             shutil.rmtree(temporary, ignore_errors=True)
+            kept = self.steps()
             raise explained(
                 error,
                 f"could not save the checkpoint {target}",
                 self.directory,
-                "the earlier checkpoints are intact: make room and resume",
+                "the earlier checkpoints are intact" if kept else "there is no earlier one",
             ) from error
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -101,6 +109,12 @@ class Checkpointer:
         replaced += [_retired(self.path(old)) for old in self.steps()[: -self.keep]]
         for folder in replaced:
             shutil.rmtree(folder, ignore_errors=True)
+
+    def remove_later(self, step: int) -> None:
+        """Remove the checkpoints after `step`, which belong to a continuation that is given up."""
+        for later in self.steps():
+            if later > step:
+                shutil.rmtree(_retired(self.path(later)), ignore_errors=True)
 
     def _clean(self) -> None:
         """Remove what a process killed while saving or removing left behind."""
@@ -110,7 +124,21 @@ class Checkpointer:
 
     def metadata(self, step: int | None = None) -> dict[str, Any]:
         """The metadata saved at `step` (the newest by default); see `restore` for errors."""
-        return self._metadata(self._existing(step))
+        step = self._existing(step)
+        _check(self.path(step), ["metadata.json"])
+        return self._metadata(step)
+
+    def check(self, step: int) -> bool:
+        """Compares a checkpoint's files with their checksums.
+
+        Returns:
+            Whether it has any; one of an earlier version has none.
+
+        Raises:
+            FileNotFoundError: there is no checkpoint of that step.
+            CorruptCheckpointError: a file is missing or is not what was written.
+        """
+        return _check(self.path(self._existing(step)))
 
     def restore(self, template: Tree, step: int | None = None) -> tuple[Tree, dict[str, Any], int]:
         """Read a checkpoint back.
@@ -135,6 +163,7 @@ class Checkpointer:
         problems = []
         for candidate in candidates:
             try:
+                self.check(candidate)
                 state = read_tree(self.path(candidate), template)
                 return state, self._metadata(candidate), candidate
             except CorruptCheckpointError as error:
@@ -160,7 +189,22 @@ class Checkpointer:
         return step
 
     def _metadata(self, step: int) -> dict[str, Any]:
-        return read_part(self.path(step), "metadata.json")
+        metadata = read_part(self.path(step), "metadata.json")
+        metadata.pop(_SEALED, None)
+        return metadata
+
+
+def _check(folder: Path, names: Iterable[str] | None = None) -> bool:
+    """Compares files of a checkpoint (by default all) with their checksums, if it has any."""
+    sealed = (folder / CHECKSUMS).exists()
+    if sealed:
+        problem = check_files(folder, names)
+    else:
+        missing = read_part(folder, "metadata.json").get(_SEALED)
+        problem = f"{CHECKSUMS} is missing" if missing else None
+    if problem:
+        raise CorruptCheckpointError(f"the checkpoint {folder} is damaged: {problem}")
+    return sealed
 
 
 def load_tree(directory: str | os.PathLike, subtree: str = "") -> dict[str, Any]:
@@ -183,18 +227,23 @@ def load_tree(directory: str | os.PathLike, subtree: str = "") -> dict[str, Any]
     if _STEP.match(directory.name):
         if not directory.is_dir():
             raise FileNotFoundError(f"there is no checkpoint {directory}")
-        return read_subtree(directory, subtree)
+        return _read_checked(directory, subtree)
     checkpoints = Checkpointer(directory)
     if not checkpoints.steps():
         raise FileNotFoundError(f"no checkpoint in {directory}")
     for step in checkpoints.steps()[::-1]:
         try:
-            return read_subtree(checkpoints.path(step), subtree)
+            return _read_checked(checkpoints.path(step), subtree)
         except CorruptCheckpointError as error:
             if step == checkpoints.steps()[0]:
                 raise
             warnings.warn(f"{error}; using the one before", stacklevel=2)
     raise AssertionError("unreachable")
+
+
+def _read_checked(folder: Path, subtree: str) -> Any:
+    _check(folder)
+    return read_subtree(folder, subtree)
 
 
 def _plain(value: Any) -> Any:

@@ -8,7 +8,12 @@ import difflib
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
+from dreamer_jax.ranges import check_ranges, setting
+
 COMPONENTS = ("encoder", "decoder", "dynamics", "reward", "termination", "value", "actor")
+
+
+_DEVIATION = "a standard deviation must be positive"
 
 
 def _require(condition: bool, message: str) -> None:
@@ -22,27 +27,27 @@ class NetworkConfig:
 
     image_size: Literal[32, 64] = 64
     """Height and width of the images, in pixels."""
-    encoder_depth: int = 32
+    encoder_depth: int = setting(32, 1, 1024)
     """Channels of the first convolution; every further one doubles them."""
-    stochastic_size: int = 30
+    stochastic_size: int = setting(30, 1, 4096)
     """Size of the stochastic part of the latent state."""
-    deterministic_size: int = 200
+    deterministic_size: int = setting(200, 1, 16_384)
     """Size of the deterministic part of the latent state (the units of the GRU)."""
-    hidden_size: int = 200
+    hidden_size: int = setting(200, 1, 16_384)
     """Units of the hidden layers inside the dynamics."""
-    head_units: int = 400
+    head_units: int = setting(400, 1, 16_384)
     """Units of the hidden layers of the reward, value, actor and termination heads."""
-    reward_layers: int = 2
+    reward_layers: int = setting(2, 0, 100)
     """Hidden layers of the reward head."""
-    value_layers: int = 3
+    value_layers: int = setting(3, 0, 100)
     """Hidden layers of the value head."""
-    actor_layers: int = 4
+    actor_layers: int = setting(4, 0, 100)
     """Hidden layers of the actor."""
     termination: bool = False
     """Whether to learn a termination head that predicts where episodes end."""
-    termination_layers: int = 3
+    termination_layers: int = setting(3, 0, 100)
     """Hidden layers of the termination head."""
-    minimum_std: float = 0.1
+    minimum_std: float = setting(0.1, 0, 10, above=True)
     """Smallest standard deviation of the latent Gaussians."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of activations; parameters, sums and distributions are always float32."""
@@ -52,8 +57,7 @@ class NetworkConfig:
             self.image_size in (32, 64),
             f"image_size is {self.image_size}, but the encoder takes images of 32 or 64 pixels",
         )
-        for name in ("encoder_depth", "stochastic_size", "deterministic_size", "hidden_size"):
-            _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
+        check_ranges(self)
 
     @property
     def feature_size(self) -> int:
@@ -65,48 +69,51 @@ class NetworkConfig:
 class LearningConfig:
     """Losses, imagination and optimisers of one update."""
 
-    batch_size: int = 50
+    batch_size: int = setting(50, 1, 100_000)
     """B, sequences in a batch."""
-    sequence_length: int = 50
+    sequence_length: int = setting(50, 1, 100_000)
     """L, records in a sequence."""
-    horizon: int = 15
+    horizon: int = setting(15, 2, 1000, why="but a return needs at least 2")
     """H, imagined steps."""
-    imagination_starts: int | None = None
+    imagination_starts: int | None = setting(None, 0, 10**9)
     """Posterior states of a batch from which to imagine; none given: all B * L of them."""
-    discount: float = 0.99
+    discount: float = setting(0.99, 0, 1)
     """Discount factor of a reward one agent step later (gamma)."""
-    return_lambda: float = 0.95
+    return_lambda: float = setting(0.95, 0, 1)
     """Weight of longer returns in the lambda-return (lambda of equation 16)."""
-    free_nats: float = 3.0
+    free_nats: float = setting(3.0, 0, 1e6)
     """Floor of the mean KL divergence between posterior and prior, in nats."""
-    kl_scale: float = 1.0
+    kl_scale: float = setting(1.0, 0, 1e6)
     """Weight of the KL divergence in the model's loss."""
-    image_std: float = 1.0
+    image_std: float = setting(1.0, 0, 1e6, above=True, why=_DEVIATION)
     """Standard deviation of the image's Gaussian likelihood, in units of the pixel range. The
     image loss is divided by its square: 0.5 at 32 x 32 pixels weighs a picture as 64 x 64 does."""
-    reward_std: float = 1.0
+    reward_std: float = setting(
+        1.0, 0, 1e6, above=True, why="a standard deviation must be positive"
+    )
     """Standard deviation of the reward's Gaussian likelihood, in rewards."""
-    termination_scale: float = 10.0
+    termination_scale: float = setting(10.0, 0, 1e6)
     """Weight of the termination head in the model's loss."""
-    model_learning_rate: float = 6e-4
+    model_learning_rate: float = setting(6e-4, 0, 1, above=True)
     """Adam's step size for encoder, decoder, dynamics, reward and termination."""
-    value_learning_rate: float = 8e-5
+    value_learning_rate: float = setting(8e-5, 0, 1, above=True)
     """Adam's step size for the value head."""
-    actor_learning_rate: float = 8e-5
+    actor_learning_rate: float = setting(8e-5, 0, 1, above=True)
     """Adam's step size for the actor."""
-    entropy_scale: float = 0.0
+    entropy_scale: float = setting(0.0, 0, 1000)
     """Weight of the policy's entropy in the actor's loss, in rewards per nat (the thesis has
     none). It keeps an actor from settling on one action early."""
-    entropy_scale_end: float | None = None
+    entropy_scale_end: float | None = setting(None, 0, 1000)
     """What entropy_scale has fallen to after entropy_decay updates; none given: it stays."""
-    entropy_decay: int = 10_000
+    entropy_decay: int = setting(10_000, 1, 10**9)
     """Updates over which entropy_scale falls linearly to entropy_scale_end."""
-    gradient_norm: float = 100.0
+    gradient_norm: float = setting(100.0, 0, 1e9, above=True)
     """Largest norm of the gradient of each of the three groups; larger ones are scaled down."""
-    adam_epsilon: float = 1e-7
+    adam_epsilon: float = setting(1e-7, 0, 1, above=True)
     """Adam's epsilon."""
     frozen: tuple[str, ...] = ()
-    """Components, or parts of them, that take no update (such as encoder, or dynamics/gru)."""
+    """What takes no update: components, parts of them, or single leaves, by their paths (such as
+    encoder, dynamics/gru, or dynamics/prior/out/kernel)."""
 
     def __post_init__(self):
         unknown = {name for name in self.frozen if name.partition("/")[0] not in COMPONENTS}
@@ -114,19 +121,7 @@ class LearningConfig:
             not unknown,
             f"cannot freeze {sorted(unknown)}: the components are {', '.join(COMPONENTS)}",
         )
-        _require(self.horizon >= 2, f"horizon is {self.horizon}, but a return needs at least 2")
-        for name in ("batch_size", "sequence_length"):
-            _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
-        for name in ("image_std", "reward_std"):
-            value = getattr(self, name)
-            _require(value > 0, f"{name} is {value}, a standard deviation must be positive")
-        for name in ("free_nats", "kl_scale", "entropy_scale_end"):
-            value = getattr(self, name)
-            _require(value is None or value >= 0, f"{name} is {value}, must not be negative")
-        _require(
-            self.entropy_scale >= 0, f"entropy_scale is {self.entropy_scale}, must not be negative"
-        )
-        _require(self.entropy_decay > 0, f"entropy_decay is {self.entropy_decay}, must be positive")
+        check_ranges(self)
         _require(
             self.entropy_scale > 0 or not self.entropy_scale_end,
             f"entropy_scale is 0 and would rise to {self.entropy_scale_end}: give both, or neither",
@@ -144,66 +139,60 @@ class ExplorationConfig:
 
     exploration_kind: Literal["gaussian", "epsilon_greedy"] = "gaussian"
     """Gaussian noise (continuous actions) or epsilon-greedy (always used if discrete)."""
-    exploration_noise: float = 0.3
+    exploration_noise: float = setting(0.3, 0, 10)
     """Standard deviation of the Gaussian noise, in units of the action range [-1, 1]."""
-    exploration_hold: float = 1.0
+    exploration_hold: float = setting(1.0, 1, 1e6, why="but an action lasts at least 1 step")
     """Agent steps for which random actions and Gaussian noise are held, on average: how long is
     geometrically distributed. 1 draws them anew at every step, as the thesis does."""
     evaluation_action: Literal["mode", "mean"] = "mode"
     """What is played in evaluation, of continuous actions: the most likely of 100 samples, or the
     tanh of the Gaussian's mean."""
-    epsilon_start: float = 0.4
+    epsilon_start: float = setting(0.4, 0, 1)
     """Probability of a random action before the first update."""
-    epsilon_end: float = 0.1
+    epsilon_end: float = setting(0.1, 0, 1)
     """Probability of a random action after epsilon_decay updates."""
-    epsilon_decay: int = 200_000
+    epsilon_decay: int = setting(200_000, 1, 10**9)
     """Updates over which epsilon falls linearly."""
 
     def __post_init__(self):
-        _require(
-            self.exploration_hold >= 1,
-            f"exploration_hold is {self.exploration_hold}, but an action lasts at least 1 step",
-        )
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class ScheduleConfig:
     """When to collect, update, evaluate and save. Environment steps count the action repeat."""
 
-    environment_steps: int = 1_000_000
+    environment_steps: int = setting(1_000_000, 1, 10**12)
     """Length of the run in environment steps, summed over tasks, prefill included."""
-    phase_environment_steps: int = 1000
+    phase_environment_steps: int = setting(1000, 1, 10**6)
     """Environment steps of one task in a phase."""
-    action_repeat: int = 2
+    action_repeat: int = setting(2, 1, 1000)
     """Environment steps for which an action is repeated."""
-    supersample: int = 1
+    supersample: int = setting(1, 1, 16)
     """Pictures are drawn this many times as large, and averaged down to the agent's size."""
-    prefill_phases: int = 5
+    prefill_phases: int = setting(5, 1, 10**6)
     """Phases of random actions before the first update (several tasks: 1 phase of each)."""
-    updates_per_phase: int = 100
+    updates_per_phase: int = setting(100, 0, 10**6)
     """Updates for each phase collected."""
-    evaluate_every: int = 10_000
+    evaluate_every: int = setting(10_000, 1, 10**12)
     """Environment steps between evaluations."""
-    checkpoint_every: int = 10_000
+    checkpoint_every: int = setting(10_000, 1, 10**12)
     """Environment steps between checkpoints."""
-    replay_keep: int | None = None
+    replay_keep: int | None = setting(None, 1, 10**12)
     """Newest records of each task that are sampled, older ones being deleted from the disk; none
     given: all of them."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
     """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
-    mapping_chunk: int = 1
+    mapping_chunk: int = setting(1, 1, 10**6)
     """Members in a chunk."""
 
     def __post_init__(self):
+        check_ranges(self)
         _require(
             self.phase_environment_steps % self.action_repeat == 0,
             f"phase_environment_steps is {self.phase_environment_steps}, which is no multiple of "
             f"the action repeat {self.action_repeat}",
         )
-        positive = ("environment_steps", "evaluate_every", "checkpoint_every", "mapping_chunk")
-        for name in (*positive, "supersample"):
-            _require(getattr(self, name) > 0, f"{name} is {getattr(self, name)}, must be positive")
-        _require(self.prefill_phases > 0, "prefill_phases must be at least 1: updates need data")
 
     @property
     def phase_ticks(self) -> int:
@@ -226,6 +215,27 @@ class Config:
             keep is None or keep >= length,
             f"replay_keep is {keep}, but a sequence has {length} records",
         )
+        check_prefill(self, 1)
+
+
+def check_prefill(config: Config, tasks: int) -> None:
+    """Whether what is collected before the first update holds one sequence.
+
+    Args:
+      config: all settings.
+      tasks: K; several are played for one phase each.
+
+    Raises:
+      ValueError: it does not.
+    """
+    phases = config.schedule.prefill_phases if tasks == 1 else 1
+    records, length = phases * (config.schedule.phase_ticks + 1), config.learning.sequence_length
+    _require(
+        length <= records,
+        f"sequence_length is {length}, but before the first update each task has {records} records "
+        f"({phases} {'phases' if phases > 1 else 'phase'} of {config.schedule.phase_ticks + 1}): "
+        f"expected a whole number in [1, {records}], or longer phases",
+    )
 
 
 def _presets() -> dict[str, Config]:

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 
 from dreamer_jax import rssm
-from dreamer_jax.agent import Agent, Batch, Params, member_key
 from dreamer_jax.config import LearningConfig
+from dreamer_jax.freezing import Params
+from dreamer_jax.model import Model
+from dreamer_jax.randomness import diagnosis_key
+from dreamer_jax.records import Records
 
 OPEN_LOOP = (5, 15)
 """Steps ahead of which rewards are predicted from actions alone."""
-
-# Keeps these random numbers apart from those of init, updates and phases (0 to 3).
-_SALT = 4
 
 
 def discounted_returns(
@@ -49,12 +49,12 @@ def discounted_returns(
 
 @functools.partial(jax.jit, static_argnames="agent")
 def diagnose(
-    agent: Agent, params: Params, records, seeds: jax.Array, phase: jax.Array
+    agent: Model, params: Params, records: Records, seeds: jax.Array, phase: jax.Array
 ) -> dict[str, jax.Array]:
     """Compares values and predicted rewards with what the first episode of each phase brought.
 
     Args:
-      agent: the agent's functions.
+      agent: its networks and settings.
       params: leaves [P, ...].
       records: leaves [P, K, T + 1, ...], as `dreamer_jax.rollout.collect` gives them.
       seeds: int32 [P].
@@ -70,27 +70,22 @@ def diagnose(
       a prediction that knows nothing.
     """
 
-    def of_task(params, records, key):
-        return _episode(agent, params, Batch(*records), key)
-
     def of_member(arguments):
         params, records, seed = arguments
-        key = jax.random.fold_in(member_key(seed, _SALT), phase)
-        tasks = records[0].shape[0]
         outputs = [
-            of_task(params, [x[k] for x in records], jax.random.fold_in(key, k))
-            for k in range(tasks)
+            _episode(agent, params, records.at(k), diagnosis_key(seed, phase, k))
+            for k in range(records.reward.shape[0])
         ]
         return jax.tree.map(lambda *x: jnp.stack(x), *outputs)
 
     # One member after another: an episode is a large batch already.
-    return jax.lax.map(of_member, (params, list(records), seeds))
+    return jax.lax.map(of_member, (params, records, seeds))
 
 
-def _episode(agent: Agent, params: Params, records: Batch, key: jax.Array):
+def _episode(agent: Model, params: Params, records: Records, key: jax.Array):
     """The comparison for the first episode of one phase, leaves [T + 1, ...]."""
     observe_key, imagine_key = jax.random.split(key)
-    posterior, _, _ = agent.observe(params, Batch(*(x[None] for x in records)), observe_key)
+    posterior, _, _ = agent.observe(params, records.at(None), observe_key)
     posterior = jax.tree.map(lambda x: x[0], posterior)
     values = agent.value(params, posterior.features)
     times = jnp.arange(values.shape[0])

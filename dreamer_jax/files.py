@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -25,9 +26,19 @@ def write_json_atomically(path: str | os.PathLike, value: Any) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def sync_folder(folder: str | os.PathLike) -> None:
+    """Wait until the names in a folder are on the disk, so that no loss of power undoes them."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def read_json(path: str | os.PathLike) -> Any:
@@ -40,9 +51,22 @@ def read_json(path: str | os.PathLike) -> Any:
 
 
 def explained(error: OSError, what: str, path: str | os.PathLike, advice: str = "") -> OSError:
-    """`error` again, of the same kind, saying what failed, where, and how full that disk is."""
+    """`error` again, of the same kind, saying what failed, where, and the way out.
+
+    Args:
+        error: what the system reported.
+        what: failed, with its name.
+        path: a place on the disk that was written to.
+        advice: what has become of everything else.
+    """
     reason = error.strerror or str(error)
-    message = f"{what}: {reason} ({_free_space(Path(path))})"
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        reason += "; allow more open files (ulimit -n) and resume"
+    elif error.errno in (errno.ENOSPC, errno.EDQUOT):
+        reason += f" ({_free_space(Path(path))}); make room and resume"
+    else:
+        reason += f" ({_free_space(Path(path))})"
+    message = f"{what}: {reason}"
     if advice:
         message += f"; {advice}"
     # Three arguments would append the path to a message that names it already.

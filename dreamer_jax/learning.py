@@ -1,41 +1,170 @@
-"""What an update minimises: the world model's loss, and the actor's and the value head's.
+"""How an agent learns: what an update minimises, with which optimisers, and the update.
 
-Thesis section 3.1, equations 16 and 17. Axis letters: B batch, L sequence length, H imagination
-horizon, A action, M latent feature size.
+The world model's loss, the actor's and the value head's (thesis section 3.1, equations 16 and 17).
+Axis letters: P population member, B batch, L sequence length, H imagination horizon, A action,
+M latent feature size. Everything here is written for one member.
 """
 
-from __future__ import annotations
-
 import functools
-from typing import TYPE_CHECKING
+from typing import Any
 
+import chex
+import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
 
-from dreamer_jax import losses, networks, rssm
+from dreamer_jax import losses, networks, randomness, rssm
 from dreamer_jax.config import LearningConfig
 from dreamer_jax.convolutions import arrange, image_distance
+from dreamer_jax.freezing import Params, check_frozen, joined, trained
+from dreamer_jax.model import Model
+from dreamer_jax.records import Records
 
-if TYPE_CHECKING:
-    from dreamer_jax.agent import Agent, Batch, Params
+Metrics = dict[str, jax.Array]
 
+GROUPS = {
+    "model": ("encoder", "decoder", "dynamics", "reward", "termination"),
+    "value": ("value",),
+    "actor": ("actor",),
+}
+"""The components that each of the three optimisers trains."""
 
 SATURATED = 0.95
 """Size of a continuous action beyond which the tanh lets less than a tenth of a gradient pass."""
 
 
-def joined(params: Params, trainable: Params) -> Params:
-    """Parameters with the parts of components in `trainable` in place of their own."""
-    return params | {name: params[name] | parts for name, parts in trainable.items()}
+@flax.struct.dataclass
+class AgentState:
+    """All that an update reads and writes. A population stacks every leaf on a leading axis P.
+
+    Attributes:
+      params: dict of components.
+      optimisers: Adam's state for each of the groups "model", "value" and "actor".
+      updates: int32 [], updates so far.
+      seed: int32 [], the member's seed; keys derive from it and `updates`.
+      healthy: bool [], False from the first update on whose losses or gradients were not
+        finite: the member is then frozen as it was before that update.
+    """
+
+    params: Params
+    optimisers: dict[str, Any]
+    updates: jax.Array
+    seed: jax.Array
+    healthy: jax.Array
 
 
-def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, key: jax.Array):
+def make_optimisers(config: LearningConfig) -> dict[str, optax.GradientTransformation]:
+    """The optimiser of each group: Adam after its gradient's norm is clipped."""
+    rates = {
+        "model": config.model_learning_rate,
+        "value": config.value_learning_rate,
+        "actor": config.actor_learning_rate,
+    }
+    return {
+        name: optax.chain(
+            optax.clip_by_global_norm(config.gradient_norm),
+            optax.adam(rate, eps=config.adam_epsilon),
+        )
+        for name, rate in rates.items()
+    }
+
+
+def trainable(model: Model, params: Params) -> dict[str, Params]:
+    """The leaves that each of the three optimisers trains, by its name: those not frozen."""
+    parts = trained(params, model.config.learning.frozen)
+    return {
+        group: {name: parts[name] for name in names if name in parts}
+        for group, names in GROUPS.items()
+    }
+
+
+def start(model: Model, params: Params, seed: jax.Array | int) -> AgentState:
+    """An agent that starts from given parameters, with fresh optimisers.
+
+    Raises:
+      ValueError: what is to be frozen is none of the agent's.
+    """
+    check_frozen(params, model.config.learning.frozen)
+    optimisers = make_optimisers(model.config.learning)
+    return AgentState(
+        params=params,
+        optimisers={
+            name: optimisers[name].init(parts) for name, parts in trainable(model, params).items()
+        },
+        updates=jnp.int32(0),
+        seed=jnp.asarray(seed, jnp.int32),
+        healthy=jnp.bool_(True),
+    )
+
+
+def update(model: Model, state: AgentState, batch: Records) -> tuple[AgentState, Metrics]:
+    """One update of model, value and actor, all gradients from the same parameters.
+
+    Args:
+      model: its networks and settings.
+      state: of one member.
+      batch: of one member, leaves [B, L, ...].
+
+    Returns:
+      The new state, and metrics: float32 scalars by name. Where a loss or gradient is not
+      finite, or was before, all but `updates` stays as it was and `healthy` is False.
+    """
+    chex.assert_rank(batch.image, 5)
+    chex.assert_shape(batch.action, (*batch.reward.shape, model.action_size))
+    chex.assert_equal_shape([batch.reward, batch.first, batch.terminal])
+    key = randomness.update_key(state.seed, state.updates)
+    model_key, behaviour_key = jax.random.split(key)
+
+    params = state.params
+    parts = trainable(model, params)
+    (_, (posterior, metrics)), model_gradient = jax.value_and_grad(
+        model_loss, argnums=1, has_aux=True
+    )(model, parts["model"], params, batch, model_key)
+    (_, behaviour_metrics), behaviour_gradient = jax.value_and_grad(
+        behaviour_loss, argnums=1, has_aux=True
+    )(
+        model,
+        parts["actor"] | parts["value"],
+        params,
+        posterior,
+        behaviour_key,
+        state.updates,
+    )
+    gradients = {"model": model_gradient} | {
+        group: {name: behaviour_gradient[name] for name in parts[group]}
+        for group in ("actor", "value")
+    }
+    metrics |= behaviour_metrics
+    for group, gradient in gradients.items():
+        if gradient:
+            norm = optax.tree.norm(gradient)
+            clipped = norm > model.config.learning.gradient_norm
+            metrics |= {
+                f"{group}_gradient_norm": norm,
+                f"{group}_gradient_clipped": clipped.astype(jnp.float32),
+            }
+
+    optimisers, memories, new_params = make_optimisers(model.config.learning), {}, params
+    for group, gradient in gradients.items():
+        updates, memories[group] = optimisers[group].update(gradient, state.optimisers[group])
+        new_params = joined(new_params, optax.apply_updates(parts[group], updates))
+    finite = jnp.isfinite(jnp.stack(list(metrics.values()))).all()
+    healthy = state.healthy & finite
+    new_params, memories = jax.tree.map(
+        lambda new, old: jnp.where(healthy, new, old),
+        (new_params, memories),
+        (params, state.optimisers),
+    )
+    return AgentState(new_params, memories, state.updates + 1, state.seed, healthy), metrics
+
+
+def model_loss(model: Model, trainable: Params, params: Params, batch: Records, key: jax.Array):
     """Loss of the world model: image and reward likelihoods and the floored KL divergence.
 
     Args:
-      agent: its modules and settings.
-      trainable: the components, or parts of them, that the gradient is taken for.
+      model: its networks and settings.
+      trainable: the leaves that the gradient is taken for.
       params: all components; what is in `trainable` is not used.
       batch: of one member.
       key: for the posterior's samples.
@@ -43,13 +172,13 @@ def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, ke
     Returns:
       The loss, and (posterior states [B, L, ...], metrics).
     """
-    config = agent.config.learning
+    config = model.config.learning
     params = joined(params, trainable)
     batch = batch._replace(image=arrange(batch.image))
-    posterior, prior_mean, prior_std = agent.observe(params, batch, key)
+    posterior, prior_mean, prior_std = model.observe(params, batch, key)
     features = posterior.features
-    image_loss = image_distance(agent.decode(params, features), batch.image).mean()
-    reward_loss = losses.unit_gaussian_loss(agent.reward(params, features), batch.reward)
+    image_loss = image_distance(model.decode(params, features), batch.image).mean()
+    reward_loss = losses.unit_gaussian_loss(model.reward(params, features), batch.reward)
     kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
     loss = image_loss / config.image_std**2 + reward_loss / config.reward_std**2
     loss += config.kl_scale * losses.floored_kl(kl, config.free_nats)
@@ -62,8 +191,8 @@ def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, ke
         "kl_share_below_floor": (kl < config.free_nats).mean(),
         "kl_floored": (mean_kl < config.free_nats).astype(jnp.float32),
     }
-    if "termination" in agent.heads:
-        logits = agent.head(params, "termination", features)[..., 0]
+    if "termination" in model.heads:
+        logits = model.head(params, "termination", features)[..., 0]
         target = config.discount * (1.0 - batch.terminal)
         termination_loss = losses.bernoulli_loss(logits, target)
         loss += config.termination_scale * termination_loss
@@ -73,7 +202,7 @@ def model_loss(agent: Agent, trainable: Params, params: Params, batch: Batch, ke
 
 
 def behaviour_loss(
-    agent: Agent,
+    model: Model,
     trainable: Params,
     params: Params,
     posterior: rssm.LatentState,
@@ -88,8 +217,8 @@ def behaviour_loss(
     fixed, on features that are, so neither loss has a gradient for the other's parameters.
 
     Args:
-      agent: its modules and settings.
-      trainable: the components of "actor" and "value" that the gradient is taken for.
+      model: its networks and settings.
+      trainable: the leaves of "actor" and "value" that the gradient is taken for.
       params: all components.
       posterior: states to start from, leaves [B, L, ...]; no gradient reaches them.
       key: for starts, actions and states.
@@ -98,7 +227,7 @@ def behaviour_loss(
     Returns:
       The sum of the losses, and metrics.
     """
-    config = agent.config.learning
+    config = model.config.learning
     starts_key, action_key, state_key = jax.random.split(key, 3)
     params = joined(jax.lax.stop_gradient(params), trainable)
     start = jax.tree.map(lambda x: jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]), posterior)
@@ -108,18 +237,18 @@ def behaviour_loss(
         start = jax.tree.map(lambda x: x[chosen], start)
 
     def policy(features, noise):
-        outputs = agent.head(params, "actor", jax.lax.stop_gradient(features))
-        return agent.sample(outputs, noise)
+        outputs = model.head(params, "actor", jax.lax.stop_gradient(features))
+        return model.sample(outputs, noise)
 
-    noise = agent.action_noise(action_key, (config.horizon, start.mean.shape[0]))
+    noise = model.action_noise(action_key, (config.horizon, start.mean.shape[0]))
     states = rssm.imagine(
-        agent.dynamics, params["dynamics"], policy, start, config.horizon, state_key, noise
+        model.dynamics, params["dynamics"], policy, start, config.horizon, state_key, noise
     )
     features = states.features
-    rewards = agent.reward(params, features)
-    values, trained_values = _forked(agent.value, params, features)
-    if "termination" in agent.heads:
-        discounts = jax.nn.sigmoid(agent.head(params, "termination", features)[..., 0])
+    rewards = model.reward(params, features)
+    values, trained_values = _forked(model.value, params, features)
+    if "termination" in model.heads:
+        discounts = jax.nn.sigmoid(model.head(params, "termination", features)[..., 0])
     else:
         discounts = jnp.full_like(rewards, config.discount)
     returns = losses.lambda_return(rewards, values, discounts, config.return_lambda)
@@ -134,8 +263,8 @@ def behaviour_loss(
     }
     # The states that the actor acted in: the start, and all but the last two.
     acted_in = jnp.concatenate([start.features[None], features[:-2]])
-    outputs = agent.head(params, "actor", jax.lax.stop_gradient(acted_in))
-    if agent.discrete:
+    outputs = model.head(params, "actor", jax.lax.stop_gradient(acted_in))
+    if model.discrete:
         entropy = losses.categorical_entropy(outputs)
     else:
         mean, std = networks.tanh_normal(outputs)

@@ -14,11 +14,13 @@ import math
 import os
 import re
 import time
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from dreamer_jax.files import explained
+from dreamer_jax.integrity import DamagedError, file_checksum, sync_files
 
 _NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _NOT_PLOTTED = {"member", "seed", "env_steps", "updates"}
@@ -79,11 +81,31 @@ class MetricsWriter:
         """Size of `metrics.jsonl` in bytes, for a checkpoint to commit."""
         return self._metrics.size
 
+    def checksum(self) -> int:
+        """CRC-32 of `metrics.jsonl` up to `offset()`, for a checkpoint to commit."""
+        return self._metrics.checksum
+
+    def sync(self) -> None:
+        """Wait until all rows are on the disk, so that no loss of power takes them."""
+        sync_files([self.path])
+
+    def check(self, offset: int, checksum: int | None = None) -> None:
+        """Whether the file holds the rows that a checkpoint committed.
+
+        Args:
+            offset: size of the rows in bytes.
+            checksum: their CRC-32; None of a checkpoint that has none.
+
+        Raises:
+            DamagedError: it does not.
+        """
+        self._metrics.check(offset, checksum)
+
     def truncate(self, offset: int) -> None:
         """Drop the rows beyond a committed offset (0: all rows), in TensorBoard's view too.
 
         Raises:
-            ValueError: the file is shorter than that, or the offset is not the end of a line.
+            DamagedError: the file is shorter than that, or the offset is not the end of a line.
         """
         self._metrics.truncate(offset)
         if self._tensorboard:
@@ -163,6 +185,7 @@ class _Lines:
         self._file = open(path, "ab", buffering=0)
         held = path.read_bytes()
         self.size = held.rfind(b"\n") + 1
+        self.checksum = zlib.crc32(held[: self.size])
         if self.size < len(held):
             self._file.truncate(self.size)
 
@@ -177,20 +200,30 @@ class _Lines:
             self._file.truncate(self.size)
             raise explained(error, f"could not write to {self.path}", self.path) from error
         self.size += len(line)
+        self.checksum = zlib.crc32(line, self.checksum)
 
-    def truncate(self, size: int) -> None:
+    def check(self, size: int, checksum: int | None) -> None:
         held = self.path.stat().st_size
         if not 0 <= size <= held:
-            raise ValueError(
+            raise DamagedError(
                 f"{self.path} has {held} bytes, {size} were to be kept: it does not belong to "
-                "this checkpoint or has lost data; resume from an older checkpoint"
+                "this checkpoint or has lost data; restore it, or resume from an older checkpoint"
+            )
+        if checksum is not None and file_checksum(self.path, size) != checksum:
+            raise DamagedError(
+                f"{self.path} is not what was written (the checksum of its first {size} bytes "
+                "differs from its checkpoint's): restore it, or resume from an older checkpoint"
             )
         with open(self.path, "rb") as file:
             file.seek(max(size - 1, 0))
             if size and file.read(1) != b"\n":
-                raise ValueError(f"byte {size} of {self.path} is not the end of a line")
+                raise DamagedError(f"byte {size} of {self.path} is not the end of a line")
+
+    def truncate(self, size: int) -> None:
+        self.check(size, None)
         self._file.truncate(size)
         self.size = size
+        self.checksum = file_checksum(self.path)
 
     def close(self) -> None:
         self._file.close()

@@ -8,7 +8,9 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from dreamer_jax.agent import Agent, AgentState, Batch
+from dreamer_jax.agent import Agent
+from dreamer_jax.learning import AgentState
+from dreamer_jax.records import Records
 
 
 def map_members(function, mapping: str, chunk: int = 1):
@@ -44,7 +46,7 @@ def map_members(function, mapping: str, chunk: int = 1):
 
 @functools.partial(jax.jit, static_argnames=("agent", "mapping", "chunk"), donate_argnums=(1, 2))
 def update_members(
-    agent: Agent, state: AgentState, sums, batch: Batch, *, mapping: str, chunk: int
+    agent: Agent, state: AgentState, sums, batch: Records, *, mapping: str, chunk: int
 ):
     """One update of every member.
 
@@ -73,7 +75,7 @@ def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> 
     """Sums of metrics before the first update, [P] each, without running an update."""
     size = agent.config.network.image_size
     shape = (batch_size, length)
-    batch = Batch(
+    batch = Records(
         image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
         action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
         reward=jax.ShapeDtypeStruct(shape, jnp.float32),

@@ -14,6 +14,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from dreamer_jax.output import SafeStream
+
 _WINDOW = 1000  # calls of `update` that the estimated time goes by
 
 
@@ -23,7 +25,8 @@ class Progress:
     A context manager. The bar is the mean of the shares of environment steps and of updates done.
     Rates count only the time spent on the thing itself: from the `phase` it began with, or the last
     time the count moved, to the next move. The time left follows from how the bar moved of late,
-    so that what was slow once (compilation) is forgotten.
+    so that what was slow once (compilation) is forgotten. It never raises: a run goes on where
+    nobody reads what it says.
 
     Args:
         total_env_steps: environment steps of the whole run.
@@ -51,7 +54,7 @@ class Progress:
         self._phase = ""
         self._last_return: float | None = None
         self._interval = interval
-        self._console = Console(file=stream or sys.stdout)
+        self._console = Console(file=SafeStream(stream or sys.stdout))
         self._live: Live | None = None
         self._printed = -math.inf
         self._history = deque([(time.monotonic(), self._share())], maxlen=_WINDOW)

@@ -7,7 +7,8 @@ changed once written, so a run is resumed by cutting every stream back to the le
 checkpoint names. The oldest may be deleted: their disk space is given back, while files keep
 their lengths and later records their places. Files are read through memory maps: the page cache
 holds what was read last and gives it back under pressure, so the process does not grow with the
-replay.
+replay. Every append has a checksum (see `dreamer_jax.stream_checksums`); what this process has not
+written itself is compared with it when it is first read.
 
 Axis letters: P population member, K task, T steps in a phase, B batch, L sequence length,
 A action. Images are uint8 [height, width, 3] with height = width = `image_size`.
@@ -24,19 +25,27 @@ from pathlib import Path
 
 import numpy as np
 
-from dreamer_jax.files import explained, read_json, write_json_atomically
+from dreamer_jax.files import explained
 from dreamer_jax.holes import free_beginning
+from dreamer_jax.integrity import (
+    DamagedError,
+    read_sealed_json,
+    sync_all,
+    sync_files,
+    write_sealed_json,
+)
 from dreamer_jax.prefetch import Prefetcher
+from dreamer_jax.records import Records
 from dreamer_jax.sampling import sample_indices
+from dreamer_jax.stream_checksums import StreamChecksums
 
-Batch = dict[str, np.ndarray]
 _HEADER = "replay.json"
 _DELETED = "deleted.json"
 _FORMAT = 1
 
 
 def record_dtype(image_size: int, action_size: int) -> np.dtype:
-    """The layout of one record on disk: packed, little-endian."""
+    """The layout of one record on disk: packed, little-endian, in the order of `Records`."""
     return np.dtype(
         [
             ("image", "u1", (image_size, image_size, 3)),
@@ -94,13 +103,19 @@ class Replay:
         self.dtype = record_dtype(image_size, action_size)
         self._open(layout)
         self._lengths = self._stored_lengths()
+        self._checksums = {
+            stream: StreamChecksums(self.path(*stream), self.dtype.itemsize)
+            for stream in self._streams()
+        }
+        self._unsynced: set[tuple[int, int]] = set()
+        self._folder_synced = False
         self._deleted = self._stored_deleted()
 
     def _open(self, layout: Mapping[str, int]) -> None:
         header = self.directory / _HEADER
         expected = {"format": _FORMAT, **layout}
         if header.exists():
-            stored = read_json(header)
+            stored = read_sealed_json(header)
             differences = [
                 f"{name} {stored.get(name)} (expected {value})"
                 for name, value in expected.items()
@@ -119,7 +134,7 @@ class Replay:
                 for task in range(self.tasks):
                     self.path(member, task).touch()
             # Written last: a folder with a header is complete.
-            write_json_atomically(header, expected)
+            write_sealed_json(header, expected)
         except OSError as error:
             raise explained(
                 error, f"could not make the replay folder {self.directory}", self.directory
@@ -159,67 +174,68 @@ class Replay:
         path = self.directory / _DELETED
         if not path.exists():
             return np.zeros_like(self._lengths)
-        return np.array(read_json(path)["deleted"], np.int64)
+        return np.array(read_sealed_json(path)["deleted"], np.int64)
 
     def _set_deleted(self, deleted: np.ndarray) -> None:
         if (deleted != self._deleted).any():
             path = self.directory / _DELETED
             try:
-                write_json_atomically(path, {"deleted": deleted.tolist()})
+                write_sealed_json(path, {"deleted": deleted.tolist()})
             except OSError as error:
                 raise explained(error, f"could not write {path}", path) from error
             self._deleted = deleted
 
-    def append(self, records: Mapping[str, np.ndarray]) -> None:
+    def append(self, records: Records) -> None:
         """Add a phase to every stream.
 
         Either all streams grow by T records or, if this raises, none does.
 
         Args:
-            records: image uint8 [P, K, T, size, size, 3], action float32 [P, K, T, A],
-                reward float32 [P, K, T], first bool [P, K, T], terminal bool [P, K, T].
+            records: leaves [P, K, T, ...].
 
         Raises:
-            ValueError: a name, shape or dtype is not as above.
+            ValueError: a shape or dtype is not that of the layout.
             OSError: the disk is full or not writable; names the file and the free space.
         """
         records = self._checked(records)
-        steps = records["reward"].shape[2]
+        steps = records.reward.shape[2]
         path = self.directory
         try:
             for stream in self._streams():
                 path = self.path(*stream)
                 rows = np.empty(steps, self.dtype)
                 for name in self.dtype.names:
-                    rows[name] = records[name][stream]
+                    rows[name] = getattr(records, name)[stream]
                 with open(path, "r+b") as file:
                     file.seek(int(self._lengths[stream]) * self.dtype.itemsize)
                     _write(file, rows)
+                checksums = self._checksums[stream]
+                if checksums.end != self._lengths[stream]:
+                    checksums.truncate(int(self._lengths[stream]))
+                checksums.append(rows.data, steps)
+                self._unsynced.add(stream)
         except OSError as error:
             self._roll_back()
             raise explained(
                 error,
                 f"could not append {steps} records to {path}",
                 path,
-                "every stream still holds what was committed before: make room and resume",
+                "every stream still holds what was committed before",
             ) from error
         except BaseException:
             self._roll_back()
             raise
         self._lengths += steps
 
-    def _checked(self, records: Mapping[str, np.ndarray]) -> Batch:
-        names = self.dtype.names
-        if set(records) != set(names):
-            raise ValueError(f"records have the keys {sorted(records)}, expected {sorted(names)}")
-        arrays = {name: np.asarray(records[name]) for name in names}
-        steps = arrays["reward"].shape[2] if arrays["reward"].ndim == 3 else "T"
-        for name, array in arrays.items():
+    def _checked(self, records: Records) -> Records:
+        arrays = records.map(np.asarray)
+        steps = arrays.reward.shape[2] if arrays.reward.ndim == 3 else "T"
+        for name, array in arrays._asdict().items():
             field = self.dtype[name]
             expected = (self.members, self.tasks, steps, *field.shape)
             if array.shape != expected or array.dtype != field.base:
                 raise ValueError(
-                    f"records[{name!r}] is {array.dtype} {list(array.shape)}, expected "
+                    f"the records' {name} is {array.dtype} {list(array.shape)}, expected "
                     f"{field.base} {list(expected)} (members, tasks, steps, ...)"
                 )
         return arrays
@@ -236,16 +252,34 @@ class Replay:
             path = self.path(*stream)
             if path.stat().st_size > size:
                 os.truncate(path, size)
+            self._checksums[stream].truncate(int(self._lengths[stream]))
 
-    def truncate(self, lengths: np.ndarray) -> None:
-        """Cut every stream back to the lengths that a checkpoint committed.
+    def checksums(self) -> list[list[int]]:
+        """CRC-32 of every stream up to its committed length, [P, K], for a checkpoint to commit."""
+        return [
+            [self._checksums[member, task].checksum for task in range(self.tasks)]
+            for member in range(self.members)
+        ]
+
+    def sync(self) -> None:
+        """Wait until all committed records are on the disk, so that no loss of power takes them."""
+        if not self._folder_synced:
+            sync_all(self.directory)
+            self._folder_synced = True
+        else:
+            for stream in self._unsynced:
+                sync_files([self.path(*stream), self._checksums[stream].path])
+        self._unsynced.clear()
+
+    def check(self, lengths: np.ndarray, checksums: Sequence[Sequence[int]] | None = None) -> None:
+        """Whether the streams can be cut back to what a checkpoint committed.
 
         Args:
             lengths: integers [P, K].
+            checksums: of the streams at these lengths; None of a checkpoint that has none.
 
         Raises:
-            ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
-                that would be sampled at these lengths are deleted; nothing is cut then.
+            ValueError: see `truncate`; a `DamagedError` if the streams' checksums are others.
         """
         lengths = np.asarray(lengths, np.int64)
         if lengths.shape != self._lengths.shape:
@@ -256,7 +290,7 @@ class Replay:
         stored = self._stored_lengths()
         for stream in self._streams():
             if not 0 <= lengths[stream] <= stored[stream]:
-                raise ValueError(
+                raise DamagedError(
                     f"{self.path(*stream)} holds {stored[stream]} records, "
                     f"{lengths[stream]} were to be kept: the file does not belong to this "
                     "checkpoint or has lost data; resume from an older checkpoint"
@@ -268,9 +302,40 @@ class Replay:
                     f"deleted, those from {needed} on were to be kept: resume from a newer "
                     "checkpoint, or with as many records kept as before"
                 )
+            if checksums is not None:
+                member, task = stream
+                checksum = checksums[member][task]
+                self._checksums[stream].check_end(int(lengths[stream]), checksum)
+
+    def truncate(self, lengths: np.ndarray) -> None:
+        """Cut every stream back to the lengths that a checkpoint committed.
+
+        Args:
+            lengths: integers [P, K].
+
+        Raises:
+            ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
+                that would be sampled at these lengths are deleted; nothing is cut then.
+        """
+        self.check(lengths)
+        lengths = np.asarray(lengths, np.int64)
         self._lengths = lengths.copy()
         self._cut()
         self._set_deleted(np.minimum(self._deleted, lengths))
+
+    def verify(self, member: int, task: int, length: int) -> tuple[str | None, int]:
+        """Compares the first `length` records of a stream, but for deleted ones, with checksums.
+
+        Returns:
+            What is wrong, if anything; and how many of the records have no checksum.
+        """
+        checksums, deleted = self._checksums[member, task], int(self._deleted[member, task])
+        try:
+            for number in checksums.overlapping(deleted, length):
+                checksums.check(number)
+        except (DamagedError, OSError) as error:
+            return str(error), 0
+        return None, checksums.unchecked(deleted, length)
 
     def _oldest_sampled(self, lengths: np.ndarray) -> np.ndarray:
         """Which records are the first that are sampled at these lengths: int64 [P, K]."""
@@ -296,6 +361,7 @@ class Replay:
         self._set_deleted(deleted)
         for stream in streams:
             path = self.path(*stream)
+            self._checksums[stream].split(int(deleted[stream]))
             try:
                 free_beginning(path, int(deleted[stream]) * self.dtype.itemsize)
             except OSError as error:
@@ -310,8 +376,8 @@ class Replay:
                 )
                 return
 
-    def read(self, member: int, task: int, start: int, stop: int) -> Batch:
-        """A copy of the records [start, stop) of one stream, by name.
+    def read(self, member: int, task: int, start: int, stop: int) -> Records:
+        """A copy of the records [start, stop) of one stream, leaves [stop - start, ...].
 
         Raises:
             ValueError: the range is not within the committed records that are not deleted.
@@ -322,12 +388,13 @@ class Replay:
                 f"records [{start}, {stop}) of {self.path(member, task)} were asked for, "
                 f"it holds [{oldest}, {held})"
             )
-        batch = self._empty((stop - start,))
+        records = self._empty((stop - start,))
         if stop > start:
+            self._checksums[member, task].check_records(start, stop)
             stream = self._map(member, task)
-            for name in batch:
-                batch[name][:] = stream[name][start:stop]
-        return batch
+            for name, values in records._asdict().items():
+                values[:] = stream[name][start:stop]
+        return records
 
     def sample(
         self,
@@ -337,7 +404,7 @@ class Replay:
         length: int,
         members: Sequence[int] | None = None,
         lengths: np.ndarray | None = None,
-    ) -> Batch:
+    ) -> Records:
         """A batch of sequences for every member.
 
         A member's rows depend only on its own seed, the update and the lengths of its own streams
@@ -353,9 +420,8 @@ class Replay:
                 ones, which are the default).
 
         Returns:
-            image uint8 [P, B, L, size, size, 3], action float32 [P, B, L, A], reward float32,
-            first bool and terminal bool [P, B, L]. The arrays are new and never written again:
-            on the CPU, JAX may use their memory without a copy.
+            Leaves [P, B, L, ...]. The arrays are new and never written again: on the CPU, JAX
+            may use their memory without a copy.
 
         Raises:
             ValueError: no stream of a member holds L records, or arguments do not fit together.
@@ -369,6 +435,7 @@ class Replay:
                 f"lengths {lengths.tolist()} are not at most the committed {self._lengths.tolist()}"
             )
         result = self._empty((len(members), batch, length))
+        fields = result._asdict()
         for position, (member, seed) in enumerate(zip(members, seeds, strict=True)):
             try:
                 tasks, starts = sample_indices(
@@ -385,30 +452,29 @@ class Replay:
             for task in np.unique(tasks):
                 stream = self._map(member, task)
                 for row in np.flatnonzero(tasks == task):
+                    self._checksums[member, task].check_records(starts[row], starts[row] + length)
                     sequence = stream[starts[row] : starts[row] + length]
-                    for name, values in result.items():
+                    for name, values in fields.items():
                         values[position, row] = sequence[name]
         return result
 
     def batches(
         self, seeds: Sequence[int], updates: Iterable[int], batch: int, length: int, depth: int = 2
-    ) -> Prefetcher[Batch]:
+    ) -> Prefetcher[Records]:
         """The batches of `updates` in turn, prepared in the background (see `Prefetcher`).
 
         All are drawn from the records committed now, even if more are appended meanwhile.
         """
         lengths = self.lengths
 
-        def prepare(update: int) -> Batch:
+        def prepare(update: int) -> Records:
             return self.sample(seeds, update, batch, length, lengths=lengths)
 
         return Prefetcher(prepare, updates, depth)
 
-    def _empty(self, shape: tuple[int, ...]) -> Batch:
-        return {
-            name: np.empty(shape + self.dtype[name].shape, self.dtype[name].base)
-            for name in self.dtype.names
-        }
+    def _empty(self, shape: tuple[int, ...]) -> Records:
+        layouts = (self.dtype[name] for name in Records._fields)
+        return Records(*(np.empty(shape + layout.shape, layout.base) for layout in layouts))
 
     def _map(self, member: int, task: int) -> np.ndarray:
         """A stream as a read-only array of records, mapped from its file for one reading.

@@ -9,34 +9,19 @@ resets.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import MODES, Agent, Mode, Params, member_key
+from dreamer_jax.agent import MODES, Agent, Mode
+from dreamer_jax.freezing import Params
+from dreamer_jax.randomness import Purpose, phase_key
+from dreamer_jax.records import Records
 
-# Salts of the keys of phases, by number of the mode; 0 and 1 are taken by dreamer_jax.agent.
-_SALTS = (2, 2, 3)
-
-
-class Records(NamedTuple):
-    """Record t holds image t and the action and reward that led to it.
-
-    Attributes:
-      image: uint8 [..., T + 1, size, size, 3].
-      action: float32 [..., T + 1, A]; zero where `first`.
-      reward: float32 [..., T + 1]; zero where `first`.
-      first: bool [..., T + 1], the record is a reset.
-      terminal: bool [..., T + 1], the episode ended here.
-    """
-
-    image: Any
-    action: Any
-    reward: Any
-    first: Any
-    terminal: Any
+# What the key of a phase is for, by number of the mode.
+_PURPOSES = tuple(Purpose.EVALUATE if mode == "evaluate" else Purpose.COLLECT for mode in MODES)
 
 
 def rollout(env, policy: Callable, carry, slot: jax.Array, key: jax.Array, ticks: int) -> Records:
@@ -70,13 +55,6 @@ def rollout(env, policy: Callable, carry, slot: jax.Array, key: jax.Array, ticks
     steps = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, steps)
     actions = jnp.concatenate([jnp.zeros_like(actions[:1]), actions])
     return Records(steps.image, actions, steps.reward, steps.first, steps.terminal)
-
-
-def phase_key(seed: jax.Array, task: jax.Array, mode: jax.Array, phase: jax.Array) -> jax.Array:
-    """The key of one phase: of (member seed, task, collect or evaluate, phase); `mode` is an index
-    in `MODES`."""
-    key = member_key(seed, jnp.array(_SALTS)[mode])
-    return jax.random.fold_in(jax.random.fold_in(key, task), phase)
 
 
 def collect(
@@ -121,7 +99,7 @@ def _collect(agent, env, params, seeds, updates, phase, mode, *, tasks, ticks) -
         def policy(carry, image, first, key):
             return agent.policy(params, carry, image, first, key, mode, updates)
 
-        key = phase_key(seed, task, mode, phase)
+        key = phase_key(seed, jnp.array(_PURPOSES)[mode], task, phase)
         return rollout(env, policy, agent.initial_carry(), slot, key, ticks)
 
     members = seeds.shape[0]

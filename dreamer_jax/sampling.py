@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dreamer_jax.randomness import batch_generator
+
 
 def sample_indices(
     seed: int,
@@ -55,6 +57,6 @@ def sample_indices(
             f"no stream is long enough for sequences of {length} records: "
             f"the streams hold {lengths.tolist()}{within}; collect more or shorten the sequences"
         )
-    random = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, update])))
+    random = batch_generator(seed, update)
     tasks = eligible[random.integers(eligible.size, size=batch)]
     return tasks, oldest[tasks] + random.integers(starts[tasks])

@@ -69,9 +69,13 @@ class Schedule:
     def evaluations(self) -> int:
         """Evaluations of one member in the whole run; a round that crosses several multiples of
         `evaluate_every` is followed by one."""
-        rounds = range(self.prefill_rounds, self.rounds + 1)
-        crossed = {self.environment_steps(r) // self.config.evaluate_every for r in rounds}
-        return len(crossed - {0})
+        steps, every = self.environment_steps(1), self.config.evaluate_every
+        if steps >= every:  # after every round
+            return self.rounds - self.prefill_rounds + 1
+        first, last = (
+            self.environment_steps(r) // every for r in (self.prefill_rounds, self.rounds)
+        )
+        return last - first + (1 if first else 0)
 
     def next(self, done: Counters) -> Action:
         """What to do after what is done."""

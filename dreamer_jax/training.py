@@ -8,10 +8,11 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 """
 
 import dataclasses
+import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,16 +21,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, AgentState, Batch, Mode
-from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
+from dreamer_jax.agent import Agent, Mode
 from dreamer_jax.diagnosis import diagnose, warnings
-from dreamer_jax.logs import MetricsWriter
+from dreamer_jax.learning import AgentState
+from dreamer_jax.locks import FolderLock
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Progress
-from dreamer_jax.replay import Replay
-from dreamer_jax.rollout import Records, collect, episodes
+from dreamer_jax.record_checks import check_records
+from dreamer_jax.records import Records
+from dreamer_jax.rollout import collect, episodes
+from dreamer_jax.run_folder import RunFolder
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.video import tile, write_video
+from dreamer_jax.waiting import to_host
 
 MAXIMUM_VIDEO_MEMBERS = 9
 
@@ -54,20 +58,26 @@ class NonFiniteError(FloatingPointError):
 
 
 class StopRequest:
-    """Turns the first Ctrl-C (or SIGTERM) into a request to stop, and lets a second one quit.
+    """Turns the first Ctrl-C (or SIGTERM, or the terminal's end) into a request to stop, and lets a
+    second one quit.
 
     A context manager; outside the main thread it does nothing, as Python allows no more.
+
+    Args:
+      notify: is told of the request in words.
+      hurry: called at the request, so that nothing that hangs is waited for.
     """
 
-    def __init__(self, notify: Callable[[str], None]):
+    def __init__(self, notify: Callable[[str], None], hurry: Callable[[], None]):
         self.requested = False
-        self._notify = notify
+        self._notify, self._hurry = notify, hurry
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+                    self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_) -> None:
@@ -78,7 +88,18 @@ class StopRequest:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+        self._hurry()
         self._notify("stopping: saving first (once more to quit without)")
+
+
+def _mean(values: Sequence[float]) -> float:
+    """The mean, NaN of nothing."""
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def _known_mean(scores: Sequence[float]) -> float:
+    """The mean of the scores that are numbers."""
+    return _mean([score for score in scores if not math.isnan(score)])
 
 
 class Run:
@@ -86,16 +107,22 @@ class Run:
 
     Args:
       agent: the agent's functions; `agent.config` holds the schedule too.
-      env: an environment of P * K slots (see `dreamer_jax.rollout`), with a method `check()` that
-        raises what its simulators met.
+      env: an environment of P * K slots (see `dreamer_jax.rollout`), with methods `check()`, which
+        raises what its simulators met; perhaps `hurry()`, after which it waits for none long; and
+        perhaps `rest(slots)`, which is told before each phase, by a mask bool [P * K], what need
+        not be simulated: the slots of frozen members.
       tasks: the names of the K tasks.
       members: the P members.
       directory: metrics, checkpoints, replay and videos go here.
       state: agents to start from, leaves [P, ...]; fresh ones by default.
       resume: continue from the folder's newest checkpoint (or from the start if there is none).
       videos: how many of the evaluations are also written as videos, spread over the run.
+      from_checkpoint: step of an older checkpoint to continue from; later ones are removed.
+      lock: the folder's lock, if the caller holds it; it is released with the run.
 
     Raises:
+      FolderInUseError: another process works in the folder.
+      DamagedError, CorruptCheckpointError: what the folder holds is not what was written.
       FileExistsError: the folder holds a run, and `resume` is False.
       ValueError: sizes of the environment, the members and the state do not fit together.
     """
@@ -111,6 +138,8 @@ class Run:
         state: AgentState | None = None,
         resume: bool = False,
         videos: int = 10,
+        from_checkpoint: int | None = None,
+        lock: FolderLock | None = None,
     ):
         config = agent.config
         if env.action_size != agent.action_size:
@@ -135,68 +164,48 @@ class Run:
         self.schedule = Schedule(config.schedule, len(self.tasks))
         self.videos = videos
         self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
-        self.checkpoints = Checkpointer(self.directory / "checkpoints")
-        self._check_folder(resume)
-
-        self.replay = Replay(
-            self.directory / "replay",
-            members=len(self.members),
-            tasks=len(self.tasks),
-            image_size=config.network.image_size,
-            action_size=agent.action_size,
-            keep=config.schedule.replay_keep,
+        self.folder = RunFolder(
+            self.directory,
+            lock=lock,
+            resume=resume or from_checkpoint is not None,
+            layout={
+                "members": len(self.members),
+                "tasks": len(self.tasks),
+                "image_size": config.network.image_size,
+                "action_size": agent.action_size,
+                "keep": config.schedule.replay_keep,
+            },
         )
-        self.writer = MetricsWriter(self.directory)
+        self.checkpoints, self.replay = self.folder.checkpoints, self.folder.replay
+        self.writer = self.folder.writer
+        try:
+            self._start(state, from_checkpoint)
+        except BaseException:
+            self.folder.close()
+            raise
+
+    def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
+        """Takes up what the folder holds, or else the state given, or else fresh agents."""
+        agent = self.agent
         self.counters = Counters()
         self.state = init_members(agent, self.seeds) if state is None else state
         if self.state.updates.shape != (len(self.members),):
             raise ValueError(
                 f"the state holds {self.state.updates.shape} members, {len(self.members)} are named"
             )
-        learning = config.learning
+        learning = agent.config.learning
         self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
-        self._restore()
-        self._healthy = np.asarray(self.state.healthy)
+        found = self.folder.restore({"agent": self.state, "sums": self.sums}, from_checkpoint)
+        if found is not None:
+            self.state, self.sums = found[0]["agent"], found[0]["sums"]
+            self.counters = Counters(**found[1])
+        self._healthy = np.array(self.state.healthy)
         self._warned: set[tuple[int, str]] = set()
-
-    # The folder.
-
-    def _check_folder(self, resume: bool) -> None:
-        if not resume and (self.directory / "replay").exists():
-            raise FileExistsError(
-                f"{self.directory} already holds a run: resume it, or choose another folder"
-            )
-
-    def _restore(self) -> None:
-        """Goes back to the newest checkpoint, or to nothing if there is none."""
-        lengths, offset = np.zeros_like(self.replay.lengths), 0
-        if self.checkpoints.latest() is not None:
-            template = {"agent": self.state, "sums": self.sums}
-            restored, metadata, _ = self.checkpoints.restore(template)
-            self.state, self.sums = restored["agent"], restored["sums"]
-            self.counters = Counters(**metadata["counters"])
-            lengths, offset = metadata["replay"], metadata["metrics"]
-        self.replay.truncate(np.asarray(lengths))
-        self.writer.truncate(offset)
 
     def save(self) -> None:
         """Writes a checkpoint of everything that a resumed run needs."""
-        metadata = {
-            "counters": dataclasses.asdict(self.counters),
-            "replay": self.replay.lengths,
-            "metrics": self.writer.offset(),
-        }
-        self.checkpoints.save(self._step(), {"agent": self.state, "sums": self.sums}, metadata)
-        self._delete_records()
-
-    def _delete_records(self) -> None:
-        """Deletes the records that are too old for every checkpoint."""
-        checkpoints = self.checkpoints
-        try:
-            lengths = [checkpoints.metadata(step)["replay"] for step in checkpoints.steps()]
-        except CorruptCheckpointError:
-            return  # until it has been replaced
-        self.replay.delete(np.min(lengths, axis=0))
+        tree = {"agent": self.state, "sums": self.sums}
+        self.folder.save(self._step(), tree, dataclasses.asdict(self.counters))
 
     def _step(self) -> int:
         """A number that grows with every action."""
@@ -217,7 +226,7 @@ class Run:
         schedule = self.schedule
         with (
             self._progress_bar() as self._bar,
-            StopRequest(self._bar.message) as stop,
+            StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
             if self.checkpoints.latest() is None:
                 self.save()
@@ -237,16 +246,19 @@ class Run:
                         self._collect("random" if action == "prefill" else "explore")
                 except (KeyboardInterrupt, NonFiniteError):
                     raise
-                except Exception:
+                except Exception as error:
                     # Nothing of the failed action has been committed.
                     self.save()
-                    raise
+                    if not stop.requested:
+                        raise
+                    self._bar.message(f"this phase is given up: {error}")
+                    return "stopped"
             self.save()
         return "finished" if action == "done" else "stopped"
 
     def close(self) -> None:
-        """Closes the metrics files. The environment belongs to the caller."""
-        self.writer.close()
+        """Closes the folder. The environment belongs to the caller."""
+        self.folder.close()
 
     def _progress_bar(self) -> Progress:
         return Progress(
@@ -269,10 +281,14 @@ class Run:
             **chosen.tags,
             "env_steps": self.schedule.environment_steps(rounds),
             "updates": self.counters.updates,
+            "healthy": bool(self._healthy[member]),
         }
 
     def _phase(self, mode: Mode, phase: int) -> Records:
         started = time.perf_counter()
+        if hasattr(self.env, "rest"):
+            # A frozen member learns nothing from what it would play.
+            self.env.rest(np.repeat(~self._healthy, len(self.tasks)))
         records = collect(
             self.agent,
             self.env,
@@ -284,8 +300,9 @@ class Run:
             ticks=self.schedule.config.phase_ticks,
             mode=mode,
         )
-        records = Records(*(np.asarray(x) for x in records))
+        records = to_host(records)
         self.env.check()
+        check_records(records, self.tasks)
         self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
@@ -293,24 +310,24 @@ class Run:
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
         rounds = self.counters.rounds
         records = self._phase(mode, rounds)
-        self.replay.append(records._asdict())
+        self.replay.append(records)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            found = episodes(Records(*(x[member, task] for x in records)))
-            scores.append(np.mean([episode.score for episode in found]))
+            found = episodes(records.at(member, task)) if self._healthy[member] else []
+            scores.append(_mean([episode.score for episode in found]))
             row = {
                 "kind": "collect",
                 **self._columns(member, rounds + 1),
                 "task": self.tasks[task],
                 "policy": mode,
                 "episodes": len(found),
-                "return": float(scores[-1]),
-                "length": float(np.mean([episode.length for episode in found])),
+                "return": scores[-1],
+                "length": _mean([episode.length for episode in found]),
             }
             self.writer.write(row)
         self._advance(rounds=rounds + 1)
         self._bar.update(
-            env_steps=self.schedule.environment_steps(rounds + 1), last_return=np.mean(scores)
+            env_steps=self.schedule.environment_steps(rounds + 1), last_return=_known_mean(scores)
         )
 
     def _update(self, stop: StopRequest) -> None:
@@ -331,7 +348,7 @@ class Run:
                     self.agent,
                     self.state,
                     self.sums,
-                    Batch(**batch),
+                    batch,
                     mapping=schedule.mapping,
                     chunk=schedule.mapping_chunk,
                 )
@@ -349,28 +366,23 @@ class Run:
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
-        healthy = np.asarray(self.state.healthy)
+        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy))
+        self._healthy = np.array(self.state.healthy)
         for member in range(len(self.members)):
             averages = {name: float(x[member]) / count for name, x in sums.items()}
-            row = {
-                "kind": "update",
-                **self._columns(member, self.counters.rounds),
-                "healthy": bool(healthy[member]),
-                **averages,
-            }
+            row = {"kind": "update", **self._columns(member, self.counters.rounds), **averages}
             self.writer.write(row)
             self._warn(member, averages)
-        for member in np.flatnonzero(self._healthy & ~healthy):
+        for member in newly_frozen:
             chosen = self.members[member]
             self._bar.message(
                 f"member {member} ({chosen.label}, seed {chosen.seed}) met a loss or gradient that "
                 f"is not finite by update {self.counters.updates}: it is frozen as it was before, "
                 "the others go on"
             )
-        self._healthy = healthy
         self.sums = jax.tree.map(jnp.zeros_like, self.sums)
         self.counters = dataclasses.replace(self.counters, averaged=0)
-        if not healthy.any():
+        if not self._healthy.any():
             self.save()
             raise NonFiniteError(
                 f"no member of {self.directory} has finite losses any more; lower the learning "
@@ -398,16 +410,17 @@ class Run:
         diagnosis = jax.device_get(found)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            episode = episodes(Records(*(x[member, task] for x in records)))[0]
-            scores.append(episode.score)
+            healthy, episode = bool(self._healthy[member]), episodes(records.at(member, task))[0]
+            knowledge = {name: float(x[member, task]) for name, x in diagnosis.items()}
+            scores.append(episode.score if healthy else math.nan)
             row = {
                 "kind": "evaluation",
                 **self._columns(member, self.counters.rounds),
                 "task": self.tasks[task],
-                "return": episode.score,
-                "length": episode.length,
-                "fell": episode.fell,
-                **{name: float(x[member, task]) for name, x in diagnosis.items()},
+                "return": scores[-1],
+                "length": episode.length if healthy else 0,
+                "fell": healthy and episode.fell,
+                **(knowledge if healthy else dict.fromkeys(knowledge, math.nan)),
             }
             self.writer.write(row)
         evaluations = self.schedule.evaluations
@@ -417,7 +430,7 @@ class Run:
         # A long round may cross several multiples; they share one evaluation.
         steps = self.schedule.environment_steps(self.counters.rounds)
         self._advance(evaluations=steps // self.schedule.config.evaluate_every)
-        self._bar.update(last_return=np.mean(scores))
+        self._bar.update(last_return=_known_mean(scores))
 
     def _write_video(self, records: Records) -> None:
         frames = records.image[:MAXIMUM_VIDEO_MEMBERS]

@@ -6,8 +6,19 @@ too.
 """
 
 from envs.base import Env, SimulatorError, TaskSpec, TimeStep
+from envs.pool import SIMULATOR_TIMEOUT
 from envs.registry import make, register_gymnasium, spec, specs, task_names
 
-__all__ = ["Env", "SimulatorError", "TaskSpec", "TimeStep", "make", "spec", "specs", "task_names"]
+__all__ = [
+    "SIMULATOR_TIMEOUT",
+    "Env",
+    "SimulatorError",
+    "TaskSpec",
+    "TimeStep",
+    "make",
+    "spec",
+    "specs",
+    "task_names",
+]
 
 register_gymnasium()

@@ -104,6 +104,11 @@ class Env(Protocol):
         """Raise the error that a simulator met, if any. Call it outside jit after a phase."""
         ...
 
+    def hurry(self) -> None:
+        """Wait no longer than a few seconds for any simulator from now on: the caller wants to
+        stop. May be called while a program runs."""
+        ...
+
     def close(self) -> None:
         """Free what the environment holds. It cannot be used afterwards."""
         ...

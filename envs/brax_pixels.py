@@ -19,7 +19,7 @@ from envs.base import Outcome, SimulatorError, TaskSpec, TimeStep
 from envs.brax_episodes import episodes_of
 from envs.brax_physics import physics_of, task_scene
 from envs.bridge import HostCalls
-from envs.pool import SimulatorPool
+from envs.pool import SIMULATOR_TIMEOUT, SimulatorPool
 from envs.ray_casting import check_size, render
 from envs.registry import BRAX_ENGINES, BRAX_RENDERERS
 from envs.rows import (
@@ -62,7 +62,7 @@ class BraxEnv:
         image_size: height and width of the images in pixels.
         action_repeat: environment steps for which an action is held.
         action_size: A, at least the largest |A| of the tasks.
-        workers: not used.
+        workers, timeout: not used.
 
     Raises:
         ValueError: for an image size that is too small.
@@ -78,6 +78,7 @@ class BraxEnv:
         action_repeat: int,
         action_size: int,
         workers: int | None = None,
+        timeout: float = SIMULATOR_TIMEOUT,
     ):
         self.tasks = tuple(tasks)
         check_size(image_size, self.tasks[0].supersample)
@@ -106,6 +107,9 @@ class BraxEnv:
 
     def check(self) -> None:
         """Nothing: there is no host on which anything could fail."""
+
+    def hurry(self) -> None:
+        """Nothing: there is no host to wait for."""
 
     def close(self) -> None:
         """Nothing: there is no host that holds anything."""
@@ -192,6 +196,7 @@ class HostDrawnBraxEnv(BraxEnv):
     Args:
         tasks, members, image_size, action_repeat, action_size: as of `BraxEnv`.
         workers: number of processes that draw, by default min(cores, slots).
+        timeout: seconds after which one that does not answer is given up.
 
     Raises:
         ValueError: for an image size that is too small.
@@ -206,6 +211,7 @@ class HostDrawnBraxEnv(BraxEnv):
         action_repeat: int,
         action_size: int,
         workers: int | None = None,
+        timeout: float = SIMULATOR_TIMEOUT,
     ):
         super().__init__(tasks, members, image_size, action_repeat, action_size)
         self._positions = max(physics.positions for physics in self._physics)
@@ -216,6 +222,7 @@ class HostDrawnBraxEnv(BraxEnv):
             self._positions,
             1,
             workers,
+            timeout,
         )
         slots = np.arange(members * len(self.tasks))
         self._pool.reset(slots, np.zeros((len(slots), 1), np.uint32))
@@ -231,8 +238,13 @@ class HostDrawnBraxEnv(BraxEnv):
         """
         self._calls.check()
 
+    def hurry(self) -> None:
+        """Wait no longer than a few seconds for pictures from now on."""
+        self._pool.hurry()
+
     def close(self) -> None:
         """End the processes that draw."""
+        self.hurry()
         jax.effects_barrier()
         self._pool.close()
 

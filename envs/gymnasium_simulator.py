@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import functools
 import math
+import traceback
 from typing import NamedTuple
 
 import gymnasium
@@ -18,7 +19,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, Space
 from PIL import Image
 
-from envs.base import Outcome, TaskSpec
+from envs.base import Outcome, SimulatorError, TaskSpec
 
 
 class _Traits(NamedTuple):
@@ -40,6 +41,7 @@ def gymnasium_task(id: str) -> TaskSpec:
         ValueError: if there is no such id (near ones are named), if it shows no images, or if
             its actions are neither a bounded `Box` nor `Discrete`.
         ModuleNotFoundError: if it needs a package that is not installed.
+        SimulatorError: if its own code raises anything else.
     """
     return _traits(id).task
 
@@ -48,9 +50,12 @@ def gymnasium_task(id: str) -> TaskSpec:
 def _traits(id: str) -> _Traits:
     name = f"gymnasium/{id}"
     env = _make(id)
-    observation, actions = env.observation_space, env.action_space
-    modes, frames = env.metadata.get("render_modes") or (), env.metadata.get("render_fps")
-    env.close()
+    try:
+        observation, actions = env.observation_space, env.action_space
+        modes, frames = env.metadata.get("render_modes") or (), env.metadata.get("render_fps")
+        env.close()
+    except Exception as error:
+        raise _failed(name, error) from error
     observes_images = _is_image(observation)
     if not observes_images and "rgb_array" not in modes:
         raise ValueError(
@@ -81,6 +86,18 @@ def _make(id: str, **options) -> gymnasium.Env:
         raise ValueError(f"unknown task {name!r}: {reason}{hint if near else ''}") from None
     except gymnasium.error.DependencyNotInstalled as error:
         raise _not_installed(name, error) from error
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"{name} cannot be made: {error}") from error
+    except gymnasium.error.Error as error:
+        raise ValueError(f"unknown task {name!r}: {error}") from error
+    except Exception as error:
+        raise _failed(name, error) from error
+
+
+def _failed(name: str, error: Exception) -> SimulatorError:
+    """What an environment's own code met, as text: its type may be known to nobody else."""
+    trace = "".join(traceback.format_exception(error))
+    return SimulatorError(f"{name} cannot be made: {type(error).__name__}: {error}\n{trace}")
 
 
 def _not_installed(name: str, error: Exception) -> ModuleNotFoundError:
@@ -150,15 +167,27 @@ class GymnasiumSimulator:
     def render(self) -> np.ndarray:
         """The present image, uint8 [image_size, image_size, 3]."""
         if self._observes_images:
-            return resize(self._observation, self._image_size)
+            return resize(_checked(self._observation, "observation"), self._image_size)
         try:
-            return resize(self._env.render(), self._image_size)
+            return resize(_checked(self._env.render(), "picture"), self._image_size)
         except gymnasium.error.DependencyNotInstalled as error:
             raise _not_installed(self._name, error) from error
 
     def close(self) -> None:
         """Free the environment."""
         self._env.close()
+
+
+def _checked(image, what: str) -> np.ndarray:
+    """An environment's picture, if it is one: cast in silence, others would turn black."""
+    array = np.asarray(image) if isinstance(image, np.ndarray | list | tuple) else None
+    fits = array is not None and array.dtype == np.uint8 and array.ndim in (2, 3) and array.size
+    if not fits or (array.ndim == 3 and array.shape[2] not in (1, 3)):
+        found = repr(image)[:80] if array is None else f"{array.dtype} {list(array.shape)}"
+        raise SimulatorError(
+            f"the environment's {what} is {found}, expected uint8 [height, width, 1 or 3]"
+        )
+    return array
 
 
 def resize(image: np.ndarray, size: int) -> np.ndarray:

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import mmap
 import os
-import pickle
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+import warnings
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -27,11 +28,19 @@ from typing import IO
 import numpy as np
 
 from envs.base import SimulatorError, TaskSpec, TimeStep
-from envs.worker import ACTIVE_WAIT, WorkerSettings, record_type
+from envs.worker import ACTIVE_WAIT, StartFailure, WorkerSettings, record_type
+
+SIMULATOR_TIMEOUT = 300.0
+"""Seconds after which a simulator that does not answer is taken for stuck, unless told otherwise.
+"""
+
+# Seconds after which that is warned of (and again after twice as many), those that are left to a
+# simulator once whoever waits has asked not to wait, and those that a process has to start.
+_PATIENCE, _HURRY, _START = 10.0, 5.0, 120.0
 
 _BOOTSTRAP = (
-    "import sys; sys.path[:] = sys.argv[3:]; "
-    "from envs.worker import main; main(int(sys.argv[1]), int(sys.argv[2]))"
+    "import sys; sys.path[:] = sys.argv[4:]; "
+    "from envs.worker import main; main(*map(int, sys.argv[1:4]))"
 )
 
 
@@ -47,6 +56,15 @@ class _Worker:
         for slot, task in self.tasks.items():
             hosted.setdefault(task.name, []).append(slot)
         return ", ".join(f"{name} (slots {slots})" for name, slots in hosted.items())
+
+    def stuck(self, slot: int, seconds: float, why: str) -> SimulatorError:
+        """Ends the process, whose simulator in that slot does not answer; returns the error."""
+        self.process.kill()
+        self.process.wait()
+        return SimulatorError(
+            f"The simulator of slot {slot}, {self.tasks[slot].name}, has not answered for "
+            f"{seconds:.0f} seconds{why}: its process {self.process.pid} was ended"
+        )
 
     def death(self) -> SimulatorError:
         """The error that says how the process ended, to be called once it has."""
@@ -76,10 +94,12 @@ class SimulatorPool:
         action_size: A, the length of every action; slots read the first |A| of their task.
         action_repeat: environment steps for which an action is held.
         workers: number of processes; by default one for each core, and never more than slots.
+        timeout: seconds after which a simulator that does not answer is taken for stuck, and its
+            process ended.
 
     Raises:
         ModuleNotFoundError: if the simulators' package is not installed.
-        SimulatorError: if a process cannot be started.
+        SimulatorError: if a process cannot be started, or a simulator fails in its first episode.
     """
 
     def __init__(
@@ -89,7 +109,9 @@ class SimulatorPool:
         action_size: int,
         action_repeat: int,
         workers: int | None = None,
+        timeout: float = SIMULATOR_TIMEOUT,
     ):
+        self._timeout, self._hurried = timeout, False
         self.tasks = tuple(tasks)
         slots = len(self.tasks)
         count = min(workers or available_cores(), slots)
@@ -115,9 +137,9 @@ class SimulatorPool:
                         WorkerSettings(hosted, slots, action_size, image_size, action_repeat)
                     )
         try:
-            if failures := self._replies(range(count)):
-                error, trace = failures[0]
-                raise pickle.loads(error) from SimulatorError(trace)
+            starting = max(timeout, _START)
+            if failures := self._replies({index: [] for index in range(count)}, starting):
+                raise self._start_error(min(failures))
         except BaseException:
             self.close()
             raise
@@ -152,27 +174,50 @@ class SimulatorPool:
             # A process that is dead is noticed when its reply is waited for.
             with suppress(ConnectionError):
                 self._workers[index].connection.send((self._request_number, command, *share))
-        if failures := self._replies(shares):
-            slot, trace = failures[0]
+        asked = {index: share[0] for index, share in shares.items()}
+        if failures := self._replies(asked, self._timeout):
+            slot, problem = min(failures)  # of the lowest slot, whoever was first
             raise SimulatorError(
-                f"The simulator of slot {slot}, {self.tasks[slot].name}, failed:\n{trace}"
+                f"The simulator of slot {slot}, {self.tasks[slot].name}, failed {problem}"
             )
         return TimeStep(*(self._records[name][slots] for name in TimeStep._fields))
 
-    def _replies(self, workers: Iterable[int]) -> list:
-        """Wait for a reply of each of `workers`; returns the failures that they report.
+    def _start_error(self, failure: StartFailure) -> Exception:
+        name = self.tasks[failure.slot].name
+        if failure.is_missing:
+            error = ModuleNotFoundError(
+                failure.problem if name in failure.problem else f"{name}: {failure.problem}"
+            )
+            error.__cause__ = SimulatorError(failure.trace)
+            return error
+        said = "\n".join(filter(None, (failure.problem, failure.trace)))
+        return SimulatorError(f"The simulator of slot {failure.slot}, {name}, failed: {said}")
+
+    def hurry(self) -> None:
+        """Leave simulators no more than a few seconds for each answer from now on: whoever waits
+        for them wants to stop. May be called from another thread."""
+        self._hurried = True
+
+    def _replies(self, asked: Mapping[int, list[int]], timeout: float) -> list:
+        """Wait for replies; returns the failures that they report.
 
         All replies are read before an error is raised. Those to an earlier request, whose wait
         was interrupted, are passed over.
+
+        Args:
+            asked: of each worker asked, the slots, in the order in which it does them.
+            timeout: seconds for which to wait.
         """
-        pending = {self._workers[index].connection: self._workers[index] for index in workers}
-        failures, dead = [], None
+        pending = {self._workers[index].connection: index for index in asked}
+        failures, error = [], None
+        began, warned = time.monotonic(), _PATIENCE
         deadline = time.perf_counter() + self._active_wait
         while not wait(list(pending), timeout=0) and time.perf_counter() < deadline:
             os.sched_yield()
         while pending:
             # Woken now and then, since a fork of a dead worker may keep its connection open.
-            for connection in wait(list(pending), timeout=2.0) or list(pending):
+            for connection in wait(list(pending), timeout=1.0) or list(pending):
+                worker = self._workers[pending[connection]]
                 try:
                     if connection.poll():
                         number, failure = connection.recv()
@@ -180,13 +225,39 @@ class SimulatorPool:
                             del pending[connection]
                             if failure is not None:
                                 failures.append(failure)
-                    elif pending[connection].process.poll() is not None:
+                    elif worker.process.poll() is not None:
                         raise EOFError
                 except (EOFError, ConnectionError):
-                    dead = pending.pop(connection)
-        if dead is not None:
-            raise dead.death()
+                    del pending[connection]
+                    error = worker.death()
+            seconds = time.monotonic() - began
+            if self._hurried and seconds > _HURRY:
+                limit, why = _HURRY, " and the run is to stop"
+            else:
+                limit, why = timeout, ""
+            if seconds > limit:
+                for index in pending.values():
+                    worker, slot = self._workers[index], self._busy_slot(index, asked[index])
+                    error = worker.stuck(slot, seconds, why)
+                pending = {}
+            elif pending and seconds > warned:
+                index = next(iter(pending.values()))
+                slot = self._busy_slot(index, asked[index])
+                warnings.warn(
+                    f"the simulator of slot {slot}, {self.tasks[slot].name}, has not answered for "
+                    f"{warned:.0f} seconds (process {self._workers[index].process.pid}); it is "
+                    f"given up after {timeout:.0f}",
+                    stacklevel=2,
+                )
+                warned *= 2
+        if error is not None:
+            raise error
         return failures
+
+    def _busy_slot(self, index: int, slots: list[int]) -> int:
+        """Which of the slots a worker was asked for it has not done yet."""
+        left = [s for s in slots if self._records["answered"][s] != self._request_number]
+        return (left or slots or list(self._workers[index].tasks))[0]
 
     def close(self) -> None:
         """End the processes. Also done when the pool is collected or the program ends."""
@@ -207,7 +278,10 @@ def _start(tasks: dict[int, TaskSpec], memory_descriptor: int) -> _Worker:
     ours, theirs = socket.socketpair()
     # What the simulators print is noise as long as they live, and a clue when they die.
     output = tempfile.TemporaryFile()
-    arguments = [str(theirs.fileno()), str(memory_descriptor), *map(os.path.abspath, sys.path)]
+    # The system ends a process with the thread that started it, so that thread has to last.
+    lasting = threading.current_thread() is threading.main_thread()
+    arguments = [theirs.fileno(), memory_descriptor, os.getpid() if lasting else 0]
+    arguments = [*map(str, arguments), *map(os.path.abspath, sys.path)]
     with theirs:
         process = subprocess.Popen(
             [sys.executable, "-c", _BOOTSTRAP, *arguments],
@@ -228,9 +302,10 @@ def _start(tasks: dict[int, TaskSpec], memory_descriptor: int) -> _Worker:
 def _stop(workers: list[_Worker]) -> None:
     for worker in workers:
         worker.connection.close()
+    deadline = time.monotonic() + 5
     for worker in workers:
         try:
-            worker.process.wait(timeout=5)
+            worker.process.wait(timeout=max(0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
             worker.process.kill()
             worker.process.wait()

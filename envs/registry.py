@@ -11,6 +11,7 @@ import gymnasium
 
 from envs.base import Env, TaskSpec
 from envs.gymnasium_simulator import gymnasium_task
+from envs.pool import SIMULATOR_TIMEOUT
 
 # Returns of whole episodes at an action repeat of 2, from 20 episodes at random and 5 of the rest.
 # A saturated actor presses a pendulum's cart against an end of the rail (constant action); who
@@ -180,6 +181,7 @@ def make(
     workers: int | None = None,
     action_size: int | None = None,
     supersample: int = 1,
+    timeout: float = SIMULATOR_TIMEOUT,
 ) -> Env:
     """The environment of a population: P = `members` simulators of each of K = len(tasks) tasks.
 
@@ -192,6 +194,8 @@ def make(
         action_size: A, the length of all actions; by default the largest |A| of the tasks.
         supersample: pictures are drawn this many times as large and averaged down, which turns
             the jumps of edges from pixel to pixel into shades; 1 draws them as they are.
+        timeout: seconds after which a simulator process that does not answer is ended, as one that
+            died by itself.
 
     Raises:
         ValueError: for an unknown task or a number that is too small.
@@ -213,6 +217,8 @@ def make(
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"got {name}={number}, expected at least 1")
+    if not timeout > 0:
+        raise ValueError(f"got timeout={timeout}, expected more than 0 seconds")
     known = tuple(replace(task, supersample=supersample) for task in known)
     largest = max(task.action_size for task in known)
     if action_size is not None and action_size < largest:
@@ -228,7 +234,8 @@ def make(
             make_env = pkgutil.resolve_name(maker)
             part = [known[k] for k in chosen]
             size = action_size or largest
-            parts.append(make_env(part, members, image_size, action_repeat, size, workers=workers))
+            options = {"workers": workers, "timeout": timeout}
+            parts.append(make_env(part, members, image_size, action_repeat, size, **options))
     except BaseException:
         for part in parts:
             part.close()

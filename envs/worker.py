@@ -6,11 +6,12 @@ and images through shared memory: an array with one record (see `record_type`) p
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import mmap
 import os
-import pickle
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +28,8 @@ from envs.wrappers import ActionPadding, ActionRepeat, make_simulator
 
 # Seconds for which either end asks again for the other's message before it falls asleep.
 ACTIVE_WAIT = 0.003
+
+_PR_SET_PDEATHSIG = 1  # from linux/prctl.h
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,22 @@ class WorkerSettings:
     action_repeat: int
 
 
+class StartFailure(NamedTuple):
+    """Why a worker cannot serve: text only, as not every exception can be pickled.
+
+    Attributes:
+        slot: whose simulator failed.
+        problem: what is wrong with it.
+        trace: the traceback, if there is one.
+        is_missing: whether a package is not installed.
+    """
+
+    slot: int
+    problem: str
+    trace: str = ""
+    is_missing: bool = False
+
+
 def record_type(action_size: int, image_size: int) -> np.dtype:
     """One slot's place in shared memory: the action going in, the time step coming out."""
     return np.dtype(
@@ -48,6 +68,7 @@ def record_type(action_size: int, image_size: int) -> np.dtype:
             ("reward", np.float32),
             ("first", np.bool_),
             ("terminal", np.bool_),
+            ("answered", np.int64),  # the number of the last request that this slot has done
         ],
         align=True,
     )
@@ -66,7 +87,12 @@ class Phase:
         self._simulator: Simulator | None = None
         self._key: Sequence[int] = ()
         self._episode = 0
+        self._ticks = 0
         self._ended = False
+
+    def place(self) -> str:
+        """Where in the phase this is, in words."""
+        return f"tick {self._ticks} of episode {self._episode} of the phase"
 
     def reset(self, key: Sequence[int]) -> TimeStep:
         """Start a phase whose episodes are seeded by `key`, any number of 32-bit words."""
@@ -78,8 +104,9 @@ class Phase:
 
     def _start_episode(self) -> TimeStep:
         words = np.random.SeedSequence([*self._key, self._episode]).generate_state(4)
-        self._simulator.reset(int.from_bytes(words.tobytes(), "little"))
         self._episode += 1
+        self._ticks = 0
+        self._simulator.reset(int.from_bytes(words.tobytes(), "little"))
         self._ended = False
         return TimeStep(self._simulator.render(), 0.0, True, False)
 
@@ -87,6 +114,7 @@ class Phase:
         """One tick: hold `action`, or start the next episode if the last one has ended."""
         if self._ended:
             return self._start_episode()
+        self._ticks += 1
         outcome = self._simulator.step(action)
         self._ended = outcome.terminal or outcome.truncated
         return TimeStep(self._simulator.render(), outcome.reward, False, outcome.terminal)
@@ -95,6 +123,23 @@ class Phase:
         if self._simulator is not None:
             self._simulator.close()
             self._simulator = None
+
+
+def _problem(time_step: TimeStep, shape: tuple[int, ...]) -> str | None:
+    """What is wrong with what a simulator gave: it must not reach the replay."""
+    image = time_step.image
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
+        what = (
+            f"{image.dtype} {list(image.shape)}" if isinstance(image, np.ndarray) else repr(image)
+        )
+        return f"its picture is {what[:200]}, expected uint8 {list(shape)}"
+    if not np.isscalar(time_step.reward) and np.shape(time_step.reward) != ():
+        return f"its reward is {time_step.reward!r}, expected one number"
+    if not np.isfinite(time_step.reward):
+        return f"its reward is {time_step.reward}, expected a finite number"
+    if abs(time_step.reward) > np.finfo(np.float32).max:
+        return f"its reward is {time_step.reward}, too large for 32 bits"
+    return None
 
 
 def _serve(connection: Connection, phases: dict[int, Phase], records: np.ndarray) -> None:
@@ -120,10 +165,14 @@ def _serve(connection: Connection, phases: dict[int, Phase], records: np.ndarray
                     time_step = phases[slot].reset(argument)
                 else:
                     time_step = phases[slot].step(actions[slot])
+                if problem := _problem(time_step, records["image"].shape[1:]):
+                    failure = (slot, f"at {phases[slot].place()}, {problem}")
+                    break
                 for result, value in zip(results, time_step, strict=True):
                     result[slot] = value
+                records["answered"][slot] = number
             except Exception:
-                failure = (slot, traceback.format_exc())
+                failure = (slot, f"at {phases[slot].place()}:\n{traceback.format_exc()}")
                 break
         connection.send((number, failure))
 
@@ -133,28 +182,64 @@ def _make_simulator(task: TaskSpec, settings: WorkerSettings) -> Simulator:
     return ActionPadding(ActionRepeat(simulator, settings.action_repeat), task.action_size)
 
 
-def _try(task: TaskSpec, settings: WorkerSettings) -> None:
-    """Starts an episode and looks at it, so that what is not installed is known at once."""
+def _try(task: TaskSpec, settings: WorkerSettings) -> str | None:
+    """Starts an episode and looks at it, so that what is not installed is known at once.
+
+    Returns:
+        What is wrong with its picture, if anything.
+    """
     simulator = _make_simulator(task, settings)
     try:
         simulator.reset(0)
-        simulator.render()
+        shape = (settings.image_size, settings.image_size, 3)
+        return _problem(TimeStep(simulator.render(), 0.0, True, False), shape)
     finally:
         simulator.close()
 
 
-def main(connection_descriptor: int, memory_descriptor: int) -> None:
-    """Serve the pool at the other end of the socket; returns when it is gone."""
+def _first_problem(settings: WorkerSettings) -> StartFailure | None:
+    """Tries the tasks, each once."""
+    tried = set()
+    for slot, task in settings.tasks.items():
+        if task in tried:
+            continue
+        tried.add(task)
+        try:
+            problem = _try(task, settings)
+        except ModuleNotFoundError as error:
+            return StartFailure(slot, str(error), traceback.format_exc(), is_missing=True)
+        except BaseException as error:  # SystemExit of a simulator too
+            problem = f"{type(error).__name__}: {error}"
+            return StartFailure(slot, problem, traceback.format_exc())
+        if problem:
+            return StartFailure(slot, problem)
+    return None
+
+
+def _die_with(parent: int) -> None:
+    """Have the system end this process with that one, even while a simulator is stuck."""
+    if parent and sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            sys.exit()  # it was gone before
+
+
+def main(connection_descriptor: int, memory_descriptor: int, parent: int) -> None:
+    """Serve the pool at the other end of the socket; returns when it is gone.
+
+    Args:
+        connection_descriptor: of the socket.
+        memory_descriptor: of the shared memory.
+        parent: the process to end with; 0 to end only after the request in work.
+    """
+    _die_with(parent)
     # Ctrl-C is for the process that trains, which ends its phase with our help.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
     connection = Connection(connection_descriptor)
     settings: WorkerSettings = connection.recv()
-    try:
-        for task in set(settings.tasks.values()):
-            _try(task, settings)
-    except Exception as error:
-        connection.send((0, (pickle.dumps(error), traceback.format_exc())))
+    if failure := _first_problem(settings):
+        connection.send((0, failure))
         return
     layout = record_type(settings.action_size, settings.image_size)
     memory = mmap.mmap(memory_descriptor, settings.slots * layout.itemsize)

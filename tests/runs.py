@@ -7,10 +7,10 @@ import jax
 import numpy as np
 
 import transfer
-from dreamer_jax.agent import Batch
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
+from dreamer_jax.records import Records
 from dreamer_jax.schedule import Counters, Schedule
 from experiments import methods
 from experiments.methods.autoencoder import UniversalAutoencoder
@@ -90,12 +90,12 @@ def finish(run, root, share=1.0) -> None:
     )
 
 
-def batch_for(agent, *leading, seed=0) -> Batch:
+def batch_for(agent, *leading, seed=0) -> Records:
     """Random records, leaves [..., B, L, ...]."""
     random = np.random.default_rng(seed)
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (*leading, learning.batch_size, learning.sequence_length)
-    return Batch(
+    return Records(
         image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
         action=random.uniform(-1, 1, (*shape, agent.action_size)).astype(np.float32),
         reward=random.normal(size=shape).astype(np.float32),

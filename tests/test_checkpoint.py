@@ -23,6 +23,7 @@ import pytest
 
 from dreamer_jax import stored_tree
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
+from dreamer_jax.integrity import write_checksums
 
 
 class Counters(NamedTuple):
@@ -435,6 +436,7 @@ def test_loading_from_nothing_is_an_error(tmp_path):
 def test_another_format_is_an_error_not_damage(folder):
     table = Checkpointer(folder).path(2) / "leaves.json"
     table.write_text(json.dumps({**json.loads(table.read_text()), "format": 99}))
+    write_checksums(table.parent)
     with pytest.raises(ValueError, match="format 99, this version reads 1"):
         load_tree(folder)
 

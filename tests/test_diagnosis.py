@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import LearningConfig, preset
 from dreamer_jax.diagnosis import diagnose, discounted_returns, warnings
-from dreamer_jax.rollout import Records
+from dreamer_jax.records import Records
 
 CONFIG = preset("debug")
 AGENT = Agent(CONFIG, 2)

@@ -15,8 +15,9 @@ import optax
 import pytest
 from numpy.testing import assert_allclose
 
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config, LearningConfig, NetworkConfig
+from dreamer_jax.records import Records
 
 GOLDEN = Path(__file__).parent / "golden"
 CASES = ("thesis", "options")
@@ -101,7 +102,7 @@ def updated(trace):
     state = agent.start(jax.tree.map(jnp.asarray, nested(under(trace, "start"))), seed=0)
     results = []
     for i in range(UPDATES):
-        batch = Batch(**under(trace, f"batch_{i}"))
+        batch = Records(**under(trace, f"batch_{i}"))
         state, metrics = update(state, batch, under(trace, f"noise_{i}"))
         results.append((state, metrics))
     return results

@@ -1,6 +1,7 @@
 """Which package may import which."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,19 @@ def test_experiments_imports_all_three():
     for path in (ROOT / "experiments").glob("**/*.py"):
         names |= packages(path)
     assert names >= set(LIBRARIES)
+
+
+@pytest.mark.parametrize("package", LIBRARIES)
+def test_modules_of_a_library_do_not_import_one_another_in_a_circle(package):
+    paths = [path for path in (ROOT / package).glob("**/*.py") if path.stem != "__init__"]
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
+    graph = {
+        name: {other for other in names for x in imported(path) if f"{x}.".startswith(f"{other}.")}
+        for name, path in names.items()
+    }
+    assert any(graph.values())
+    # Raises an error that names the circle; imports for type checks alone count too.
+    tuple(TopologicalSorter(graph).static_order())
 
 
 @pytest.mark.parametrize("room", ROOMS)

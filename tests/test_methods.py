@@ -13,9 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import transfer
 from compilation import QUICK_CODE
 from dreamer_jax import rssm
-from dreamer_jax.agent import Batch
 from dreamer_jax.networks import Head
-from dreamer_jax.rollout import Records
 from experiments.methods.meta import MetaModel
 from experiments.methods.modules.meta import recognise
 from experiments.runs.agents import make_agent
@@ -388,7 +386,7 @@ def test_latent_states_are_samples_along_episodes_or_their_means_or_of_single_im
     source = load_sources(spec_of("ant", sources=(folder / "uae",), method="uae")).agents[0]
     agent, size = make_agent(source.spec), CONFIG.network.stochastic_size
     batch = batch_for(agent)
-    records = Records(*(x[0] for x in batch))._replace(first=np.arange(5) == 0)
+    records = batch.at(0)._replace(first=np.arange(5) == 0)
     found = {
         (kind, seed): np.asarray(
             infer(agent, source.params, records, jax.random.key(seed), features=kind)
@@ -396,7 +394,7 @@ def test_latent_states_are_samples_along_episodes_or_their_means_or_of_single_im
         for kind in ("sample", "mean", "first")
         for seed in (0, 1)
     }
-    alone = jax.tree.map(lambda x: x[None], Batch(*records))
+    alone = records.at(None)
     posterior, _, _ = jax.jit(agent.observe)(source.params, alone, jax.random.key(0))
     assert_allclose(found["sample", 0], posterior.features[0], rtol=1e-5, atol=1e-6)
     assert_allclose(found["mean", 0][:, :size], posterior.mean[0], rtol=1e-5, atol=1e-6)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from compilation import QUICK_CODE
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import collect
 from probes import Probe
@@ -36,7 +36,7 @@ def stored_batches(agent):
         ticks=STORED * B * L - 1,
         mode="random",
     )
-    return Batch(*(x[0, 0].reshape(STORED, B, L, *x.shape[3:]) for x in records))
+    return records.at(0, 0).map(lambda x: x.reshape(STORED, B, L, *x.shape[1:]))
 
 
 def equations(jaxpr):

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from dreamer_jax import replay as replay_module
 from dreamer_jax.prefetch import Prefetcher
+from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 from dreamer_jax.sampling import sample_indices
 
@@ -27,13 +29,13 @@ def phase(members, tasks, steps, start=0):
     )
     reward = (1e6 * member + 1e4 * task + t).astype(np.float32)
     noise = np.random.default_rng([members, tasks, steps, start])
-    return {
-        "image": noise.integers(0, 256, (*reward.shape, SIZE, SIZE, 3), dtype=np.uint8),
-        "action": noise.normal(size=(*reward.shape, ACTION)).astype(np.float32),
-        "reward": reward,
-        "first": t % 7 == 0,
-        "terminal": t % 7 == 6,
-    }
+    return Records(
+        image=noise.integers(0, 256, (*reward.shape, SIZE, SIZE, 3), dtype=np.uint8),
+        action=noise.normal(size=(*reward.shape, ACTION)).astype(np.float32),
+        reward=reward,
+        first=t % 7 == 0,
+        terminal=t % 7 == 6,
+    )
 
 
 def make(directory, members=2, tasks=2, steps=(30,), **settings):
@@ -49,9 +51,8 @@ def files(directory):
 
 
 def assert_same(actual, expected):
-    assert actual.keys() == expected.keys()
-    for name in expected:
-        np.testing.assert_array_equal(actual[name], expected[name], strict=True)
+    for values, wanted in zip(actual, expected, strict=True):
+        np.testing.assert_array_equal(values, wanted, strict=True)
 
 
 # --- storing --------------------------------------------------------------------------------------
@@ -63,11 +64,9 @@ def test_what_is_appended_is_read_back_with_its_dtypes(tmp_path):
     for part in parts:
         replay.append(part)
     for stream in np.ndindex(2, 3):
-        expected = {
-            name: np.concatenate([part[name][stream] for part in parts]) for name in parts[0]
-        }
+        expected = jax.tree.map(lambda *x: np.concatenate(x), *(x.at(*stream) for x in parts))
         assert_same(replay.read(*stream, 0, 14), expected)
-        assert_same(replay.read(*stream, 4, 7), {name: x[4:7] for name, x in expected.items()})
+        assert_same(replay.read(*stream, 4, 7), expected.at(slice(4, 7)))
 
 
 def test_a_folder_opened_again_holds_the_same_records_and_grows_from_there(tmp_path):
@@ -122,16 +121,9 @@ def test_records_that_do_not_fit_are_refused_and_nothing_is_stored(
     tmp_path, name, wrong, got, expected
 ):
     replay = make(tmp_path, steps=[])
-    with pytest.raises(ValueError, match=rf"'{name}'.*{got}.*{expected}"):
-        replay.append({**phase(2, 2, 5), name: wrong})
+    with pytest.raises(ValueError, match=rf" {name} .*{got}.*{expected}"):
+        replay.append(phase(2, 2, 5)._replace(**{name: wrong}))
     assert (replay.lengths == 0).all() and not any(files(tmp_path).values())
-
-
-def test_records_with_a_missing_name_are_refused(tmp_path):
-    records = phase(2, 2, 5)
-    del records["terminal"]
-    with pytest.raises(ValueError, match="expected .*'terminal'"):
-        make(tmp_path, steps=[]).append(records)
 
 
 # --- failures -------------------------------------------------------------------------------------
@@ -288,16 +280,16 @@ def test_every_update_and_every_seed_draws_anew():
 def test_sampled_sequences_are_runs_of_one_members_own_records(tmp_path):
     replay = make(tmp_path, members=3, tasks=2, steps=[30, 25])
     batch = replay.sample([5, 6, 7], 11, batch=9, length=13)
-    assert batch["image"].shape == (3, 9, 13, SIZE, SIZE, 3)
+    assert batch.image.shape == (3, 9, 13, SIZE, SIZE, 3)
     for member, row in np.ndindex(3, 9):
-        rewards = batch["reward"][member, row]
+        rewards = batch.reward[member, row]
         owner, rest = divmod(int(rewards[0]), 10**6)
         task, start = divmod(rest, 10**4)
         assert owner == member
         expected = replay.read(member, task, start, start + 13)
-        assert_same({name: x[member, row] for name, x in batch.items()}, expected)
+        assert_same(batch.at(member, row), expected)
     # Sequences longer than an episode of 7 cross its end, with every reset marked.
-    assert (batch["first"].sum(-1) >= 1).all()
+    assert (batch.first.sum(-1) >= 1).all()
 
 
 def test_a_members_batch_depends_only_on_its_own_seed_and_streams(tmp_path):
@@ -308,9 +300,8 @@ def test_a_members_batch_depends_only_on_its_own_seed_and_streams(tmp_path):
     alone = small.sample([42], 7, 5, 6, members=[1])
     beside = small.sample([9, 42], 7, 5, 6)
     elsewhere = large.sample([42, 1, 2, 3], 7, 5, 6, members=[3, 0, 1, 2])
-    for name in alone:
-        np.testing.assert_array_equal(alone[name][0], beside[name][1])
-        np.testing.assert_array_equal(alone[name][0], elsewhere[name][0])
+    assert_same(alone.at(0), beside.at(1))
+    assert_same(alone.at(0), elsewhere.at(0))
 
 
 def test_sampling_as_of_earlier_lengths_ignores_what_came_later(tmp_path):
@@ -395,14 +386,14 @@ def test_going_back_to_where_deleted_records_were_sampled_is_refused(tmp_path):
     # Nothing at all is needed by a run that starts again.
     replay.truncate(np.zeros((2, 2), int))
     replay.append(phase(2, 2, 70))
-    assert_same(replay.read(0, 0, 0, 70), {n: x[0, 0] for n, x in phase(2, 2, 70).items()})
+    assert_same(replay.read(0, 0, 0, 70), phase(2, 2, 70).at(0, 0))
 
 
 def test_a_replay_opened_without_a_limit_never_samples_what_is_deleted(tmp_path):
     replay = make(tmp_path, steps=[200], keep=60)
     replay.delete(replay.lengths)
     everything = make(tmp_path, steps=[])
-    times = everything.sample([0, 1], 0, 50, 20)["reward"] % 10**4
+    times = everything.sample([0, 1], 0, 50, 20).reward % 10**4
     assert times.min() >= 140 and times.max() <= 199
 
 
@@ -433,14 +424,14 @@ def test_where_files_cannot_have_holes_a_warning_says_so_and_all_goes_on(tmp_pat
 def test_a_batch_handed_out_is_never_written_again(tmp_path):
     replay = make(tmp_path, steps=[20])
     batch = replay.sample([0, 1], 0, 4, 6)
-    kept = {name: x.copy() for name, x in batch.items()}
+    kept = batch.map(np.copy)
     others = [replay.sample([0, 1], update, 4, 6) for update in range(1, 4)]
     replay.truncate(np.zeros((2, 2), int))
     replay.append(phase(2, 2, 20, start=500))
     assert_same(batch, kept)
-    for name, array in batch.items():
+    for name, array in batch._asdict().items():
         assert type(array) is np.ndarray and array.flags.owndata
-        assert not any(np.shares_memory(array, other[name]) for other in others)
+        assert not any(np.shares_memory(array, getattr(other, name)) for other in others)
 
 
 def anonymous_bytes():
@@ -454,13 +445,13 @@ def test_memory_does_not_grow_with_the_replay(tmp_path):
     # A million environment steps of three members, 18 GB, may take 4 GiB: here a hundredth.
     replay = Replay(tmp_path, 3, 1, 64, ACTION)
     steps = 500
-    records = {
-        "image": np.ones((3, 1, steps, 64, 64, 3), np.uint8),
-        "action": np.ones((3, 1, steps, ACTION), np.float32),
-        "reward": np.ones((3, 1, steps), np.float32),
-        "first": np.zeros((3, 1, steps), bool),
-        "terminal": np.zeros((3, 1, steps), bool),
-    }
+    records = Records(
+        image=np.ones((3, 1, steps, 64, 64, 3), np.uint8),
+        action=np.ones((3, 1, steps, ACTION), np.float32),
+        reward=np.ones((3, 1, steps), np.float32),
+        first=np.zeros((3, 1, steps), bool),
+        terminal=np.zeros((3, 1, steps), bool),
+    )
     replay.append(records)
     replay.sample([0, 1, 2], 0, 4, 50)
     before = anonymous_bytes()

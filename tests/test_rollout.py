@@ -8,7 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dreamer_jax import rollout as rollouts
 from dreamer_jax.agent import MODES, Agent
 from dreamer_jax.config import preset
-from dreamer_jax.rollout import Records, collect, episodes, phase_key, rollout
+from dreamer_jax.randomness import Purpose, phase_key
+from dreamer_jax.records import Records
+from dreamer_jax.rollout import collect, episodes, rollout
 from probes import Probe
 
 T = 30
@@ -79,10 +81,10 @@ def test_episodes_by_hand():
 
 def test_keys_of_phases_differ_by_member_task_mode_and_phase():
     keys = {
-        tuple(jax.random.key_data(phase_key(seed, task, MODES.index(mode), phase)).tolist())
+        tuple(jax.random.key_data(phase_key(seed, purpose, task, phase)).tolist())
         for seed in range(3)
         for task in range(2)
-        for mode in ("explore", "evaluate")
+        for purpose in (Purpose.COLLECT, Purpose.EVALUATE)
         for phase in range(3)
     }
     assert len(keys) == 3 * 2 * 2 * 3

@@ -13,7 +13,7 @@ import pytest
 from compilation import update_with_quick_code
 from dreamer_jax import config as configs
 from dreamer_jax import training
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import update_members
@@ -113,7 +113,7 @@ def test_updates_are_not_compiled_again_after_the_first(finished):
     batch = run.replay.sample([0, 7], 0, learning.batch_size, learning.sequence_length)
     state = jax.tree.map(jnp.copy, run.state)
     sums = jax.tree.map(jnp.copy, run.sums)
-    update_members(AGENT, state, sums, Batch(**batch), mapping="auto", chunk=1)
+    update_members(AGENT, state, sums, batch, mapping="auto", chunk=1)
     assert update_members._cache_size() == before
 
 
@@ -248,7 +248,8 @@ def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_withou
     finished, tmp_path, capsys, monkeypatch
 ):
     directory, whole = finished
-    original, updates = training.update_members, []
+    original, updates, rested = training.update_members, [], []
+    monkeypatch.setattr(Probe, "rest", lambda self, slots: rested.append(slots.tolist()), False)
 
     def poisoning(agent, state, sums, batch, **options):
         updates.append(jax.tree.map(lambda x: np.array(x[1]), state.params))
@@ -266,8 +267,17 @@ def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_withou
 
     rows, others = ([r for r in read_metrics(d)] for d in (tmp_path, directory))
     assert [r for r in rows if r["member"] == 0] == [r for r in others if r["member"] == 0]
-    healthy = [r["healthy"] for r in rows if r["member"] == 1 and r["kind"] == "update"]
-    assert healthy == [True, False, False, False]
+    second = [r for r in rows if r["member"] == 1]
+    # Four updates in, after the second evaluation; what it would have played is told as unknown.
+    for kind, healthy in (
+        ("update", [True, False, False, False]),
+        ("evaluation", [True, False, False, False]),
+        ("collect", [True, True, False, False]),
+    ):
+        found = [r for r in second if r["kind"] == kind]
+        assert [r["healthy"] for r in found] == healthy, kind
+        assert [np.isfinite(r["return"]) for r in found if "return" in r] in ([], healthy)
+    assert rested == [[False, healthy] for healthy in (False,) * 3 + (True,) * 5]
     # Bit for bit: the one as in the run without an accident, the other as before its own.
     first, second = (jax.tree.map(lambda x, p=p: x[p], run.state) for p in range(2))
     chex.assert_trees_all_equal(first, jax.tree.map(lambda x: x[0], whole.state))
@@ -352,7 +362,7 @@ def test_discrete_choices_are_learned_with_their_values(tmp_path, monkeypatch):
     random = [row["return"] for row in rows if row.get("policy") == "random"]
     assert np.mean(random) < 0.5 * ticks
     # Discount 0.5: values 2, 1 and 0.5 at distances 0, 1 and 2.
-    batch = Batch(**run.replay.sample([0], 10**6, 50, 8))
+    batch = run.replay.sample([0], 10**6, 50, 8)
     params = jax.tree.map(lambda x: x[0], run.state.params)
     batch = jax.tree.map(lambda x: x[0], batch)
     posterior, _, _ = jax.jit(agent.observe)(params, batch, jax.random.key(0))

@@ -19,15 +19,16 @@ START = """
 import os
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
 import jax, jax.numpy as jnp, numpy as np
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.records import Records
 
 members, (batch, length, size, actions) = 3, (2, 5, 32, 2)
 agent = Agent(preset("debug"), actions)
 state = init_members(agent, jnp.arange(members))
 shape = (members, batch, length)
-batches = Batch(
+batches = Records(
     np.zeros((*shape, size, size, 3), np.uint8),
     np.zeros((*shape, actions), np.float32),
     np.zeros(shape, np.float32),

@@ -2,6 +2,8 @@
 
 import contextlib
 
+from dreamer_jax.integrity import DamagedError
+
 FAILURE, USAGE, STOPPED = 1, 2, 130
 
 
@@ -14,5 +16,7 @@ def usage_errors():
     """What is raised while input is read and checked is the user's to mend."""
     try:
         yield
-    except (ValueError, FileExistsError, ModuleNotFoundError) as error:
+    except DamagedError:
+        raise
+    except (ValueError, FileExistsError, NotADirectoryError, ModuleNotFoundError) as error:
         raise UsageError(str(error)) from error

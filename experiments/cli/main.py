@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import tyro
 
+from dreamer_jax.output import safe_output
+from dreamer_jax.ranges import check_ranges
 from experiments.cli import runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 from experiments.cli.options import Base, read_base
@@ -47,6 +49,7 @@ COMMANDS = {
     "evaluate": _plain(runs.Evaluate, runs.evaluate),
     "classify": _plain(runs.Classify, runs.classify),
     "report": _plain(runs.Report, runs.report),
+    "verify": _plain(runs.Verify, runs.verify),
     "export": _plain(sharing.Export, sharing.export),
     "zoo": _plain(sharing.Zoo, sharing.zoo),
     "table": _plain(thesis.Tables, thesis.tables, thesis.table_defaults),
@@ -69,9 +72,15 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _keep_compiled_functions()
+    with safe_output():
+        return _main(arguments, program)
+
+
+def _main(arguments: list[str], program: str) -> int:
     try:
         with usage_errors():
             command, options = _parse(arguments, program)
+            check_ranges(options)
         return command.carry_out(options)
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -96,10 +105,13 @@ def _is_told(error: Exception) -> bool:
     if isinstance(error, OSError | ModuleNotFoundError):
         return True
     from dreamer_jax.checkpoint import CorruptCheckpointError
+    from dreamer_jax.integrity import DamagedError
+    from dreamer_jax.record_checks import RecordsError
     from dreamer_jax.training import NonFiniteError
     from envs import SimulatorError
 
-    return isinstance(error, SimulatorError | NonFiniteError | CorruptCheckpointError)
+    known = (SimulatorError, NonFiniteError, CorruptCheckpointError, DamagedError, RecordsError)
+    return isinstance(error, known)
 
 
 def _keep_compiled_functions() -> None:
@@ -107,7 +119,10 @@ def _keep_compiled_functions() -> None:
 
     JAX reads this as it is imported; its own setting takes precedence.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # neither HOME nor an entry in the list of users
+        return
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache / "dreamer-transfer" / "jax"))
 
 

@@ -15,8 +15,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from dreamer_jax.config import Config
+from dreamer_jax.locks import FolderLock
+from dreamer_jax.ranges import setting
 from experiments import methods
-from experiments.cli.exits import STOPPED, UsageError, usage_errors
+from experiments.cli.exits import FAILURE, STOPPED, UsageError, usage_errors
 from experiments.cli.options import (
     DEFAULT_PRESET,
     Base,
@@ -40,7 +42,7 @@ class Run:
     for any gymnasium environment with images, such as gymnasium/CartPole-v1."""
     out: Path
     """The results folder."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = setting((0,), 0, 2**31 - 1)
     """One agent per seed; all train as one population."""
     preset: Preset = DEFAULT_PRESET
     """Settings to start from; each can be overridden by its name below."""
@@ -49,10 +51,16 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
+    from_checkpoint: int | Literal["list"] | None = None
+    """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
+    lists what there is."""
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
+    """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
+    and ended."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +125,14 @@ class Evaluate:
 
     directory: tyro.conf.Positional[Path]
     """The results folder."""
-    episodes: int = 5
+    episodes: int = setting(5, 1, 10**6)
     """Episodes per agent and task."""
     video: bool = False
     """Write videos of an episode and of an open-loop prediction into the folder."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
+    """Seconds after which a simulator that does not answer is taken for stuck."""
 
 
 @dataclass(frozen=True)
@@ -141,16 +151,16 @@ class Classify:
     """Those of the tasks that the classifier is fitted on; the others are novel."""
     out: Path | None = None
     """Folder for the table and the picture; by default classification/ in the source's."""
-    source_member: int = 0
+    source_member: int = setting(0, 0, 10**6)
     """Which member of the source's population."""
-    samples: int = 100
+    samples: int = setting(100, 1, 10**6)
     """Latent states of each task to fit on, and as many, of other episodes, to test."""
-    thresholds: tuple[float, ...] = ()
+    thresholds: tuple[float, ...] = setting((), 0, 1e9, above=True)
     """Distances beyond which a state is novel; by default 50, 70 and 90 for 230 features, scaled
     to the agent's. One suggested by the fitted samples is always added."""
-    quantile: float = 0.95
+    quantile: float = setting(0.95, 0, 1)
     """Share of known samples that the suggested threshold should hold."""
-    neighbours: int = 5
+    neighbours: int = setting(5, 1, 10**6)
     """Nearest samples that vote for the task."""
     policy: Literal["random", "trained"] = "random"
     """Who plays: random actions, or a trained agent (the mode, without noise)."""
@@ -160,11 +170,11 @@ class Classify:
     features: Literal["sample", "mean", "first"] = "sample"
     """The latent state: a sample of the posterior along an episode (what agents act on), its mean,
     or each image as if it were the first of an episode."""
-    seed: int = 0
+    seed: int = setting(0, 0, 2**31 - 1)
     """Of episodes, actions and samples."""
     accept_failed: bool = False
     """Take agents whose losses were not finite any more, as they were before."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
 
 
@@ -180,10 +190,18 @@ class Report:
     """The results folder, or several."""
     out: Path = Path("comparison.png")
     """Of several folders: the picture to draw; an .svg is written beside it."""
-    seeds: tuple[int, ...] = SEEDS
+    seeds: tuple[int, ...] = setting(SEEDS, 0, 2**31 - 1)
     """Of all results: the seeds that tables and figures show."""
     backend: Backend = "bullet"
     """Of all results: the simulators."""
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Compare results folders with the checksums in them, and name what is damaged."""
+
+    directories: tyro.conf.Positional[tuple[Path, ...]]
+    """Results folders, or folders of several."""
 
 
 def train(command: Train) -> int:
@@ -191,6 +209,12 @@ def train(command: Train) -> int:
     from experiments.runs.spec import RunSpec
 
     run = command.run
+    if run.from_checkpoint == "list":
+        from experiments.runs.verify import checkpoint_table
+
+        with usage_errors():
+            print(checkpoint_table(run.out))
+        return 0
     with usage_errors():
         method = make_method(command.method, command.transfer)
         spec = RunSpec(run.task, run.seeds, command.config, method)
@@ -202,8 +226,10 @@ def train(command: Train) -> int:
         begun = make_run(
             spec,
             run.out,
-            resume=run.resume,
+            resume=run.resume or run.from_checkpoint is not None,
             workers=run.workers,
+            timeout=run.simulator_timeout,
+            from_checkpoint=run.from_checkpoint,
             accept_failed=run.accept_failed,
         )
     if spec.method.needs:
@@ -240,8 +266,28 @@ def report(command: Report) -> int:
     return 0
 
 
+def verify(command: Verify) -> int:
+    """Compares results folders with their checksums."""
+    from experiments.runs.verify import report_of
+
+    with usage_errors():
+        text, sound = report_of(command.directories)
+    print(text)
+    return 0 if sound else FAILURE
+
+
 def evaluate(command: Evaluate) -> int:
     """Plays episodes and prints their returns."""
+    with usage_errors():
+        from experiments.runs.spec import read_spec
+
+        read_spec(command.directory)
+        lock = FolderLock(command.directory, ".evaluation.lock")
+    with lock:
+        return _evaluate(command)
+
+
+def _evaluate(command: Evaluate) -> int:
     import numpy as np
     from rich.progress import Progress
 
@@ -249,8 +295,6 @@ def evaluate(command: Evaluate) -> int:
     from experiments.runs.evaluate import evaluate, load_agents
     from experiments.runs.text import aligned
 
-    if command.episodes < 1:
-        raise UsageError(f"--episodes is {command.episodes}, must be at least 1")
     with usage_errors():
         agents = load_agents(command.directory)
     with Progress() as bar:
@@ -260,6 +304,7 @@ def evaluate(command: Evaluate) -> int:
             command.episodes,
             video=command.video,
             workers=command.workers,
+            timeout=command.simulator_timeout,
             report=lambda done, score: bar.update(
                 job, completed=done, description=f"evaluating, return {score:.0f}"
             ),
@@ -294,7 +339,6 @@ def classify(command: Classify) -> int:
     """Tells the tasks of latent states."""
     from rich.progress import Progress
 
-    from dreamer_jax.files import write_json_atomically
     from experiments.runs import classify
     from experiments.runs.agents import load_source
 
@@ -325,7 +369,17 @@ def classify(command: Classify) -> int:
                 **request,
             )
     folder = command.source / "classification" if command.out is None else command.out
-    folder.mkdir(parents=True, exist_ok=True)
+    with usage_errors():
+        lock = FolderLock(folder, ".classification.lock")
+    with lock:
+        _write_classification(command, outcome, folder, request)
+    return 0
+
+
+def _write_classification(command: Classify, outcome, folder: Path, request: dict) -> None:
+    from dreamer_jax.files import write_json_atomically
+    from experiments.runs import classify
+
     print("Novel tasks: share taken for novel. Known: taken for not novel / for the right task.\n")
     print(classify.table(outcome) + "\n\n" + classify.distance_table(outcome) + "\n")
     settings = {"source": str(command.source), "features": command.features, **request}
@@ -334,4 +388,3 @@ def classify(command: Classify) -> int:
     )
     for path in (folder / "classification.json", *classify.plot(outcome, folder / "latents")):
         print(f"wrote {path}")
-    return 0

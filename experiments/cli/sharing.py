@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+from dreamer_jax.ranges import setting
 from experiments.cli.exits import usage_errors
 
 
@@ -22,13 +23,13 @@ class Export:
     """The results folder; its newest checkpoint is exported."""
     out: Path
     """The file of weights to write; the card is written beside it."""
-    member: int = 0
+    member: int = setting(0, 0, 10**6)
     """Which member of the population."""
-    episodes: int = 10
+    episodes: int = setting(10, 1, 10**6)
     """Episodes of each task to play for the card."""
     note: str = ""
     """A sentence for the card."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 import tyro
 
 from dreamer_jax import config as configs
+from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
 from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
 from experiments.thesis import grid
@@ -27,17 +28,17 @@ class Sweep:
     preset: Preset = DEFAULT_PRESET
     """Settings of all agents, each of which can be overridden by its name below; results are in a
     folder of that name."""
-    seeds: tuple[int, ...] = grid.SEEDS
+    seeds: tuple[int, ...] = setting(grid.SEEDS, 0, 2**31 - 1)
     """Seeds of targets and baselines; source agents have the first of them."""
     backend: Backend = "bullet"
     """The simulators."""
-    omegas: tuple[float, ...] = grid.OMEGAS
+    omegas: tuple[float, ...] = setting(grid.OMEGAS, 0, 1)
     """Train targets of these fractions only; what is left out is shown as not run."""
-    counts: tuple[int, ...] = grid.COUNTS
+    counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
     results: Path = Path("results")
     """The folder of all results."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
@@ -97,7 +98,7 @@ class Demo:
     """The folder of all results; the demo's are in one of its preset's name."""
     preset: Literal["demo", "debug"] = "demo"
     """debug runs the same in seconds."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+from dreamer_jax.ranges import Range
 from experiments.methods.base import (
     SOURCE_HELP,
     Cell,
@@ -28,7 +29,12 @@ class UniversalAutoencoder(Method):
         SOURCE_HELP,
         folder=True,
     )
-    source_member: int = setting(0, "source-member", "Which member of each source's population.")
+    source_member: int = setting(
+        0,
+        "source-member",
+        "Which member of each source's population.",
+        allowed=Range(0, 10**6),
+    )
     dynamics: Literal["fresh", "copied", "frozen"] = setting(
         "fresh",
         "dynamics",

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
+from dreamer_jax.ranges import Range
+
 if TYPE_CHECKING:
     import transfer
     from dreamer_jax.agent import Agent
@@ -33,7 +35,9 @@ SOURCE_HELP = (
 )
 
 
-def setting(default: Any, option: str, help: str, *, folder: bool = False) -> Any:
+def setting(
+    default: Any, option: str, help: str, *, folder: bool = False, allowed: Range | None = None
+) -> Any:
     """A field of a method that is also an option of the command line.
 
     Args:
@@ -41,8 +45,11 @@ def setting(default: Any, option: str, help: str, *, folder: bool = False) -> An
       option: its name on the command line, without dashes before it.
       help: what it is.
       folder: whether it names results folders.
+      allowed: the range of a number, or of the numbers in a tuple.
     """
     metadata = {"option": option, "help": help, "folder": folder}
+    if allowed is not None:
+        metadata["range"] = allowed
     return dataclasses.field(default=default, metadata=metadata)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from dreamer_jax.ranges import Range
 from experiments.methods.base import Cell, Held, require, setting
 from experiments.methods.targets import Targets
 
@@ -18,7 +19,10 @@ class FractionalTransfer(Targets):
     )
 
     omegas: tuple[float, ...] = setting(
-        (), "omega", "Fractions of the source's last reward and value layers to add (0 to 1)."
+        (),
+        "omega",
+        "Fractions of the source's last reward and value layers to add (0 to 1).",
+        allowed=Range(0, 1),
     )
     fractions: tuple[str, ...] = setting(
         ("reward", "value", "termination"),

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from dreamer_jax.ranges import Range
 from experiments.methods.autoencoder import UniversalAutoencoder
 from experiments.methods.base import Cell, Held, Knowledge, Sources, require, setting
 
@@ -36,6 +37,7 @@ class MetaModel(UniversalAutoencoder):
         (),
         "reward-counts",
         "How many of these a target reads, the first ones; one target per number and seed.",
+        allowed=Range(1, 1000),
     )
     meta: tuple[str, ...] = setting(
         ("reward",),
@@ -43,7 +45,10 @@ class MetaModel(UniversalAutoencoder):
         "The components that are meta-models (any of reward, value, dynamics).",
     )
     meta_layers: int = setting(
-        1, "meta-layers", "Hidden layers of a meta-model of reward or value."
+        1,
+        "meta-layers",
+        "Hidden layers of a meta-model of reward or value.",
+        allowed=Range(0, 100),
     )
     switching: bool = setting(
         False,
@@ -56,6 +61,7 @@ class MetaModel(UniversalAutoencoder):
         "threshold",
         "With --switching, the distance beyond which a task is novel; by default suggested by the "
         "samples of the known tasks.",
+        allowed=Range(0, 1e9, above=True),
     )
 
     def check_settings(self) -> None:

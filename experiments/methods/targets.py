@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dreamer_jax.ranges import Range
 from experiments.methods.base import (
     SOURCE_HELP,
     Cell,
@@ -27,7 +28,12 @@ class Targets(Method):
         SOURCE_HELP,
         folder=True,
     )
-    source_member: int = setting(0, "source-member", "Which member of each source's population.")
+    source_member: int = setting(
+        0,
+        "source-member",
+        "Which member of each source's population.",
+        allowed=Range(0, 10**6),
+    )
     baseline: bool = setting(
         False, "baseline", "Add agents from scratch, one per seed, to the transfer targets."
     )

@@ -30,17 +30,15 @@ def make_agent(spec: RunSpec) -> Agent:
     if (chosen := spec.method.plan()) is None:
         return agent
     fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
-    kept = {
-        "/".join(path.split("/")[:2])
-        for path, rule in transfer.claims(chosen, fresh).items()
-        if rule.frozen
-    }
+    kept = [path for path, rule in transfer.claims(chosen, fresh).items() if rule.frozen]
     learning = spec.config.learning
-    learning = dataclasses.replace(learning, frozen=(*learning.frozen, *sorted(kept)))
+    learning = dataclasses.replace(learning, frozen=(*learning.frozen, *kept))
     return dataclasses.replace(agent, config=dataclasses.replace(spec.config, learning=learning))
 
 
-def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
+def make_env(
+    spec: RunSpec, workers: int | None = None, timeout: float = envs.SIMULATOR_TIMEOUT
+) -> envs.Env:
     """The simulators of a run: one for every member and task."""
     return envs.make(
         spec.tasks,
@@ -49,6 +47,7 @@ def make_env(spec: RunSpec, workers: int | None = None) -> envs.Env:
         action_repeat=spec.config.schedule.action_repeat,
         workers=workers,
         supersample=spec.config.schedule.supersample,
+        timeout=timeout,
     )
 
 

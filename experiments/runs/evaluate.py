@@ -12,14 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer_jax.agent import Agent, Batch
-from dreamer_jax.rollout import Episode, Records, collect, episodes
+import envs
+from dreamer_jax.agent import Agent
+from dreamer_jax.randomness import EVALUATION_PHASES
+from dreamer_jax.records import Records
+from dreamer_jax.rollout import Episode, collect, episodes
 from dreamer_jax.video import tile, write_video
+from dreamer_jax.waiting import to_host
 from experiments.runs.agents import load_params, make_agent, make_env
 from experiments.runs.spec import RunSpec, read_spec
 
-# Phases of training are numbered from 0; these lie beyond them, so starts are new ones.
-FIRST_PHASE = 1_000_000
 CONTEXT = 5
 PREDICTED_FRAMES = 60
 SHOWN_MEMBERS = 8
@@ -55,6 +57,7 @@ def evaluate(
     *,
     video: bool = False,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     report: Callable[[int, float], Any] = lambda done, score: None,
 ) -> list[dict[str, Any]]:
     """Plays episodes with every member of a run: the mode, without noise, up to the first fall.
@@ -64,6 +67,7 @@ def evaluate(
       count: episodes per member and task.
       video: whether to write videos/evaluate_TASK.mp4 and videos/prediction_TASK.mp4.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
       report: called after each episode with how many are done and their mean return.
 
     Returns:
@@ -71,7 +75,7 @@ def evaluate(
       fell.
     """
     directory, spec, params = agents
-    agent, env = make_agent(spec), make_env(spec, workers)
+    agent, env = make_agent(spec), make_env(spec, workers, timeout)
     rows = []
     try:
         for number in range(count):
@@ -113,12 +117,12 @@ def _played(agent: Agent, env, agents: Agents, number: int) -> Records:
         agents.params,
         seeds,
         jnp.zeros_like(seeds),
-        jnp.int32(FIRST_PHASE + number),
+        jnp.int32(EVALUATION_PHASES[number]),
         tasks=len(spec.tasks),
         ticks=spec.config.schedule.phase_ticks,
         mode="evaluate",
     )
-    records = Records(*(np.asarray(x) for x in records))
+    records = to_host(records)
     env.check()
     return records
 
@@ -128,7 +132,7 @@ def _rows(spec: RunSpec, records: Records, number: int) -> list[dict[str, Any]]:
     for (p, member), (k, task) in (
         (a, b) for a in enumerate(spec.members) for b in enumerate(spec.tasks)
     ):
-        episode = episodes(Records(*(x[p, k] for x in records)))[0]
+        episode = episodes(records.at(p, k))[0]
         rows.append(
             {
                 "member": p,
@@ -167,15 +171,15 @@ def write_videos(
         name = re.sub(r"[^\w.-]", "_", task)
         frames = records.image[: len(members), k]
         paths.append(write_video(folder / f"evaluate_{name}.mp4", tile(frames), fps=30))
-        longest = [_longest_episode(Records(*(x[p, k] for x in records))) for p in members]
+        longest = [_longest_episode(records.at(p, k)) for p in members]
         length = min(PREDICTED_FRAMES, min(episode.length + 1 for episode in longest))
         if length <= CONTEXT:
             continue
         windows = [
-            Records(*(x[p, k, episode.start : episode.start + length] for x in records))
+            records.at(p, k, slice(episode.start, episode.start + length))
             for p, episode in zip(members, longest, strict=True)
         ]
-        batch = Batch(*(np.stack(x)[:, None] for x in zip(*windows, strict=True)))
+        batch = jax.tree.map(lambda *x: np.stack(x)[:, None], *windows)
         shown = jax.tree.map(lambda x: x[: len(members)], params)
         paths.append(
             write_video(
@@ -189,7 +193,7 @@ def _longest_episode(records: Records) -> Episode:
     return max(episodes(records), key=lambda episode: episode.length)
 
 
-def prediction_frames(agent: Agent, params, batch: Batch) -> np.ndarray:
+def prediction_frames(agent: Agent, params, batch: Records) -> np.ndarray:
     """Truth, model and error of open-loop predictions, as frames of a video.
 
     Args:

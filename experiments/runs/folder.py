@@ -5,6 +5,7 @@ of its members. Nothing else says where a cell is, so that folders may be copied
 and read there. A folder that cannot be read is warned of, and its cells count as missing.
 """
 
+import contextlib
 import math
 import re
 import warnings
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
+from dreamer_jax.integrity import DamagedError, read_sealed_json
 from dreamer_jax.logs import read_metrics
 
 CELLS = "cells.json"
@@ -54,6 +56,10 @@ def read_cells(folder: Path) -> tuple[str, ...]:
     names = read_json(folder / CELLS)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{folder / CELLS} is no list of names")
+    with contextlib.suppress(OSError, DamagedError):  # of which `read_spec` tells
+        header = read_sealed_json(folder / "run.json")
+        if isinstance(header, dict) and header.get("cells", names) != names:
+            raise ValueError(f"{folder / CELLS} names other cells than run.json: restore it")
     return tuple(names)
 
 

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from dreamer_jax.agent import Agent, Batch
-from dreamer_jax.rollout import Records, collect
+from dreamer_jax.agent import Agent
+from dreamer_jax.randomness import LATENT_PHASES
+from dreamer_jax.records import Records
+from dreamer_jax.rollout import collect
+from dreamer_jax.waiting import to_host
 from experiments.runs.agents import Source, make_agent
-
-# Phases of training and of evaluations are numbered below; starts of these are new ones.
-FIRST_PHASE = 2_000_000
 
 Features = Literal["sample", "mean", "first"]
 Policy = Literal["random", "trained"]
@@ -69,7 +69,7 @@ def infer(
       features: "sample" of the posterior, its "mean" instead, or "first": each image as if it were
         the first of an episode, so that nothing but the image counts.
     """
-    batch = Batch(*(jnp.asarray(x)[None] for x in records))
+    batch = records.map(lambda x: jnp.asarray(x)[None])
     if features == "first":
         batch = batch._replace(first=jnp.ones_like(batch.first))
     posterior, _, _ = agent.observe(params, batch, key)
@@ -129,18 +129,18 @@ def gather(
                 jax.tree.map(lambda x: jnp.asarray(x)[None], actor.params),
                 jnp.array([seed], jnp.int32),
                 jnp.zeros(1, jnp.int32),
-                jnp.int32(FIRST_PHASE + phase),
+                jnp.int32(LATENT_PHASES[phase]),
                 tasks=len(tasks),
                 ticks=source.spec.config.schedule.phase_ticks,
                 mode="random" if policy == "random" else "evaluate",
             )
-            records = Records(*(np.asarray(x)[0] for x in records))
+            records = to_host(records).at(0)
             env.check()
             missing = agent.action_size - acting.action_size
             action = np.pad(records.action, ((0, 0), (0, 0), (0, missing)))
             records = records._replace(action=action)
             for k in range(len(tasks)):
-                one = Records(*(x[k] for x in records))
+                one = records.at(k)
                 sampling_key = jax.random.fold_in(jax.random.fold_in(key, phase), k)
                 inferred = infer(agent, source.params, one, sampling_key, features=features)
                 # Numbers of episodes go on from phase to phase.

@@ -9,15 +9,18 @@ import importlib.metadata
 import json
 import platform
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 import jax
 import numpy as np
 
+import envs
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
-from dreamer_jax.files import write_json_atomically
+from dreamer_jax.integrity import DamagedError, write_sealed_json
+from dreamer_jax.locks import FolderLock
 from dreamer_jax.training import Run
 from experiments.runs.agents import make_agent, make_env
 from experiments.runs.spec import RunSpec, read_spec
@@ -60,6 +63,10 @@ def make_run(
     workers: int | None = None,
     base: str | Path = "",
     accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+    from_checkpoint: int | None = None,
+    lock: FolderLock | None = None,
+    cells: Sequence[str] = (),
 ) -> Run:
     """Prepares a run: simulators, agents, and the results folder.
 
@@ -70,43 +77,90 @@ def make_run(
       workers: simulator processes; by default one per core.
       base: the folder that the spec's relative paths start from; by default the working directory.
       accept_failed: take sources that failed, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
+      from_checkpoint: step of an older checkpoint to go on from.
+      lock: the folder's lock, if the caller holds it; released with the run, or when this raises.
+      cells: names of the cells of the grid that the members are.
 
     Raises:
+      FolderInUseError: another process works in the folder.
+      DamagedError: the folder lacks files, or holds others than were written.
       ValueError: the folder holds another run, or a source does not fit.
       FileExistsError: the folder holds a run, and `resume` is False.
     """
     directory = Path(directory)
-    header = directory / "run.json"
-    if header.exists():
-        different = read_spec(directory).differences(spec)
-        if different:
-            raise ValueError(
-                f"{directory} holds another run (there / here: {'; '.join(map(str, different))}): "
-                "give the same settings, or choose another folder"
-            )
-        if not resume:
-            raise FileExistsError(
-                f"{directory} already holds this run: add --resume, or choose another folder"
-            )
-    state, report = None, None
-    if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
-        state, report = transferred_members(
-            spec, load_sources(spec, base, accept_failed=accept_failed), workers=workers
-        )
-    agent = make_agent(spec)
-    env = make_env(spec, workers=workers)
+    _check_folder(directory, spec, resume)
+    # A new folder is made only when everything that may be wrong with the input has been looked at.
+    if lock is None and directory.exists():
+        lock = FolderLock(directory)
+    env = None
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        state, report = None, None
+        if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
+            sources = load_sources(spec, base, accept_failed=accept_failed)
+            state, report = transferred_members(spec, sources, workers=workers)
+        agent = make_agent(spec)
+        env = make_env(spec, workers=workers, timeout=timeout)
+        lock = lock or FolderLock(directory)
+        _check_folder(directory, spec, resume)  # again, now that nobody else can change it
         if report is not None:
             write_report(report, directory)
         # Written last: what has a header can be resumed.
-        if not header.exists():
+        if not (directory / "run.json").exists():
+            named = {"cells": list(cells)} if cells else {}
             made_with = {"versions": _versions(), "revision": _revision()}
-            write_json_atomically(header, {"spec": spec.to_dict(), **made_with})
-        return Run(agent, env, spec.tasks, spec.members, directory, state=state, resume=True)
+            content = {"spec": spec.to_dict(), **named, **made_with}
+            write_sealed_json(directory / "run.json", content)
+        return Run(
+            agent,
+            env,
+            spec.tasks,
+            spec.members,
+            directory,
+            state=state,
+            resume=True,
+            from_checkpoint=from_checkpoint,
+            lock=lock,
+        )
     except BaseException:
-        env.close()
+        if lock is not None:
+            lock.release()
+        if env is not None:
+            env.close()
         raise
+
+
+def _check_folder(directory: Path, spec: RunSpec, resume: bool) -> None:
+    """Whether a run of the spec may be begun in a folder, or resumed in it."""
+    if directory.exists() and not directory.is_dir():
+        raise NotADirectoryError(f"{directory} is a file: name a folder for the results")
+    if not (directory / "run.json").exists():
+        names = ("metrics.jsonl", "replay", "checkpoints")
+        if held := [name for name in names if _holds(directory, name)]:
+            raise DamagedError(
+                f"{directory} holds {' and '.join(held)} of a run, but no run.json to say which: "
+                "restore it, or choose another folder (or move this one away) to start again"
+            )
+        return
+    different = read_spec(directory).differences(spec)
+    if different:
+        raise ValueError(
+            f"{directory} holds another run (there / here: {'; '.join(map(str, different))}): "
+            "give the same settings, or choose another folder"
+        )
+    if not resume:
+        raise FileExistsError(
+            f"{directory} already holds this run: add --resume, or choose another folder"
+        )
+
+
+def _holds(directory: Path, name: str) -> bool:
+    """Whether something of a run is kept under that name."""
+    path = directory / name
+    if path.is_dir():
+        records = any(file.stat().st_size for file in path.glob("member_*/*"))
+        return records or Checkpointer(path).latest() is not None
+    return path.exists() and path.stat().st_size > 0
 
 
 def write_report(report: transfer.Report, directory: Path) -> None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import envs
 from dreamer_jax import config as configs
 from dreamer_jax.config import Config, Difference
-from dreamer_jax.files import read_json
+from dreamer_jax.integrity import read_sealed_json
+from dreamer_jax.ranges import check_ranges
 from experiments import methods
 from experiments.methods.base import BASELINE as BASELINE
 from experiments.methods.base import Method, require
@@ -47,6 +48,8 @@ class RunSpec:
             all(0 <= seed < 2**31 for seed in self.seeds),
             f"seeds {self.seeds} must lie in [0, 2^31)",
         )
+        configs.check_prefill(self.config, len(self.tasks))
+        check_ranges(self.method)
 
     @property
     def members(self) -> "tuple[Member, ...]":
@@ -124,7 +127,7 @@ def read_spec(directory: str | Path) -> RunSpec:
             f"{directory} holds no run (there is no {path.name} in it); "
             "make one with: python -m experiments train --task ... --out " + str(directory)
         )
-    return RunSpec.from_dict(read_json(path)["spec"])
+    return RunSpec.from_dict(read_sealed_json(path)["spec"])
 
 
 def action_size(tasks: tuple[str, ...]) -> int:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 import transfer
-from dreamer_jax.agent import AgentState
+from dreamer_jax.learning import AgentState
 from experiments.methods import Sources
 from experiments.runs.agents import check_source, load_source, make_agent
 from experiments.runs.latents import own_latents

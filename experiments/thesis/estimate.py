@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from dreamer_jax.agent import Agent, Batch
+from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
@@ -69,12 +70,12 @@ class Estimate:
     disk: int
 
 
-def _batch(agent: Agent, members: int) -> Batch:
+def _batch(agent: Agent, members: int) -> Records:
     """Records of the sizes of a batch, leaves [P, B, L, ...]."""
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (members, learning.batch_size, learning.sequence_length)
     random = np.random.default_rng(0)
-    return Batch(
+    return Records(
         image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
         action=np.zeros((*shape, agent.action_size), np.float32),
         reward=np.zeros(shape, np.float32),

@@ -5,7 +5,6 @@ the next time.
 """
 
 import contextlib
-import fcntl
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,8 @@ import jax
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 from dreamer_jax.files import write_json_atomically
+from dreamer_jax.locks import FolderInUseError, FolderLock
+from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
 from experiments.runs.folder import CELLS, begun, set_aside
@@ -58,23 +59,16 @@ def train(
       SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
     """
     folder, spec = root / run.name, run.spec
+    lock = FolderLock(folder)
     if not begun(folder):
-        folder.mkdir(parents=True, exist_ok=True)
         # Of a run that was stopped before anything was kept, perhaps one of other cells.
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
         spec = in_memory(spec)
     try:
-        return carry_out(
-            make_run(
-                spec,
-                folder,
-                resume=True,
-                workers=workers,
-                base=root,
-                accept_failed=accept_failed,
-            )
-        )
+        options = {"workers": workers, "base": root, "lock": lock, "cells": run.cells}
+        options["accept_failed"] = accept_failed
+        return carry_out(make_run(spec, folder, resume=True, **options))
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
@@ -113,15 +107,14 @@ def carry_out_runs(
 @contextlib.contextmanager
 def _alone(root: Path) -> Iterator[None]:
     """Keeps other processes from training runs under a root, until this one is done or dead."""
-    root.mkdir(parents=True, exist_ok=True)
-    with open(root / ".lock", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(
-                f"another command is training in {root}: wait until it is done, or name another "
-                "folder with --results"
-            ) from None
+    try:
+        lock = FolderLock(root)
+    except FolderInUseError as error:
+        raise ValueError(
+            f"another command is training in {root} ({error.holder}): wait until it is done, or "
+            "name another folder with --results"
+        ) from None
+    with lock:
         yield
 
 
@@ -143,12 +136,14 @@ def _carry_out(
         say(f"run {number} of {len(due)}, {run.name}: {_described(run)}; it {verb}")
         try:
             outcome = train(run, root, workers)
+        except FolderInUseError as error:
+            progress.failed[run.name] = str(error)
         except (ValueError, CorruptCheckpointError) as error:
             damaged = begun(root / run.name)
             progress.failed[run.name] = (
                 _aside(root / run.name, str(error)) if damaged else str(error)
             )
-        except (SimulatorError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
+        except (SimulatorError, NonFiniteError, RecordsError, jax.errors.JaxRuntimeError) as error:
             progress.failed[run.name] = f"{error} (it is kept as it is; the same command goes on)"
         else:
             if outcome == "stopped":
