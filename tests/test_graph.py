@@ -106,7 +106,7 @@ def test_what_is_missing_of_a_population_is_made_in_another(tmp_path):
     finish(new, tmp_path)
     assert {run.state for run in plan(SMALL, root=tmp_path)} == {"done"}
     outcomes = read_outcomes(tmp_path, cells_of(SMALL))
-    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}
 
 
 def test_what_is_missing_and_no_product_is_split_into_products(tmp_path):
@@ -152,7 +152,7 @@ def test_results_that_were_copied_are_done_there_too(tmp_path):
     root = tmp_path / "there" / "debug"
     assert {run.state for run in plan(SMALL, root=root)} == {"done"}
     outcomes = read_outcomes(root, cells_of(SMALL))
-    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}
     # Where checkpoints were left behind, what is evaluated to the end counts.
     for folder in root.iterdir():
         shutil.rmtree(folder / "checkpoints")

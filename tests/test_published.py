@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_jax.files import read_json
-from experiments.reports.page import STYLE
+from experiments.reports import page
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
 from experiments.thesis.published import PATH, classification, records, returns
@@ -206,10 +206,14 @@ def test_each_contradiction_says_what_where_and_what_is_done():
         assert place.lower() in text.lower()
 
 
-@pytest.mark.parametrize("path", [PATH, STYLE])
+READ = (PATH, *(Path(page.__file__).with_name(name) for name in ("page.css", "page.html.j2")))
+
+
+@pytest.mark.parametrize("path", READ)
 def test_what_the_report_reads_is_packaged(path):
     root = Path(__file__).parent.parent
     settings = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]
     package = ".".join(path.parent.relative_to(root).parts)
-    patterns = settings["package-data"][package]
+    data = settings["package-data"]
+    patterns = [*data["*"], *data.get(package, [])]
     assert path.exists() and any(fnmatch(path.name, pattern) for pattern in patterns)

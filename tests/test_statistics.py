@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import mannwhitneyu
+from scipy.stats import mannwhitneyu, norm
 
 from experiments.reports import statistics
 from experiments.reports.statistics import Estimate
@@ -38,12 +38,17 @@ def test_the_interquartile_mean_of_three_is_their_mean():
 
 def test_final_returns_are_those_of_the_last_ten_of_a_hundred_evaluations():
     steps = [10_000 * (i + 1) for i in range(100)]
-    found = statistics.final(steps, np.arange(100.0), 1_000_000)
+    found = statistics.final(steps, np.arange(100.0), 1_000_000, planned=100)
     assert found.tolist() == list(range(90, 100))
 
 
 def test_final_returns_are_those_of_the_last_evaluation_if_none_lies_in_the_last_tenth():
-    assert statistics.final([30, 60], [1.0, 2.0], 100).tolist() == [2.0]
+    assert statistics.final([400, 800], [1.0, 2.0], 1000, planned=2).tolist() == [2.0]
+
+
+def test_a_run_that_was_cut_before_its_last_tenth_has_no_final_returns():
+    assert statistics.final([400], [1.0], 1000, planned=2).tolist() == []
+    assert statistics.final([100, 950], [1.0, 2.0], 1000, planned=3).tolist() == [2.0]
 
 
 def test_a_jumpstart_compares_the_first_evaluations_alone():
@@ -103,10 +108,10 @@ def test_runs_are_drawn_anew_within_their_stratum():
     assert statistics.aggregate(strata, draws()) == Estimate(50.0, 50.0, 50.0)
 
 
-def test_a_single_run_has_no_interval_and_no_verdict():
-    change = statistics.difference(np.array([5.0]), np.array([1.0, 2.0]), draws())
-    assert change == Estimate(3.5, None, None)
-    assert statistics.verdict(change) is None
+def test_a_single_run_has_no_interval():
+    assert statistics.aggregate([np.array([5.0])], draws()) == Estimate(5.0, None, None)
+    one = statistics.improvement(np.array([5.0]), np.array([1.0, 2.0]))
+    assert one == Estimate(1.0, None, None)
 
 
 def test_the_same_generator_gives_the_same_interval():
@@ -129,8 +134,9 @@ def test_a_shift_of_the_runs_moves_value_and_interval_with_it(scores, shift):
 @settings(max_examples=15, deadline=None)
 def test_the_interval_holds_the_value(ours, baseline):
     for estimate in (
-        statistics.difference(ours, baseline, draws()),
-        statistics.improvement([(ours, baseline)], draws()),
+        statistics.aggregate([ours, baseline], draws()),
+        statistics.improvement(ours, baseline),
+        statistics.mean_improvement([(ours, baseline)], draws()),
     ):
         assert estimate.low <= estimate.value <= estimate.high
 
@@ -155,7 +161,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say_for_many_runs_and_n
 def test_the_probability_of_improvement_counts_pairs_and_halves_of_equal_ones():
     # 3 > 1, 3 > 2, 3 = 3, 2 > 1, 2 = 2, 2 < 3
     ours, baseline = np.array([3.0, 2.0]), np.array([1.0, 2.0, 3.0])
-    estimate = statistics.improvement([(ours, baseline)], draws())
+    estimate = statistics.improvement(ours, baseline)
     assert estimate.value == pytest.approx((1 + 1 + 0.5 + 1 + 0.5 + 0) / 6)
 
 
@@ -163,43 +169,39 @@ def test_the_probability_of_improvement_counts_pairs_and_halves_of_equal_ones():
 @settings(max_examples=15, deadline=None)
 def test_the_probability_of_improvement_is_mann_and_whitneys_statistic(ours, baseline):
     expected = mannwhitneyu(ours, baseline).statistic / (len(ours) * len(baseline))
-    found = statistics.improvement([(ours, baseline)], draws()).value
+    found = statistics.improvement(ours, baseline).value
     assert found == pytest.approx(expected)
-    assert statistics.improvement([(baseline, ours)], draws()).value == pytest.approx(1 - found)
+    assert statistics.improvement(baseline, ours).value == pytest.approx(1 - found)
 
 
 def test_the_probability_of_improvement_is_averaged_over_tasks():
     low, high = np.array([0.0, 1.0]), np.array([5.0, 6.0])
     pairs = [(high, low), (low, high), (high, low), (high, low)]
-    assert statistics.improvement(pairs, draws()) == Estimate(0.75, 0.75, 0.75)
+    assert statistics.mean_improvement(pairs, draws()) == Estimate(0.75, 0.75, 0.75)
 
 
-# --- verdicts -------------------------------------------------------------------------------------
-
-
-@given(SCORES)
+@given(SCORES, SCORES)
 @settings(max_examples=15, deadline=None)
-def test_runs_like_the_baselines_are_no_improvement_and_a_neutral_transfer(scores):
-    assert statistics.improvement([(scores, scores)], draws()).value == 0.5
-    assert statistics.verdict(statistics.difference(scores, scores, draws())) == "neutral"
+def test_the_interval_of_the_probability_of_improvement_is_a_mirror_image(ours, baseline):
+    one, other = statistics.improvement(ours, baseline), statistics.improvement(baseline, ours)
+    np.testing.assert_allclose([1 - one.high, 1 - one.low], [other.low, other.high], atol=1e-6)
 
 
-def test_a_transfer_is_judged_by_whether_its_interval_excludes_zero():
-    assert statistics.verdict(Estimate(2.0, 0.1, 4.0)) == "positive"
-    assert statistics.verdict(Estimate(2.0, 0.0, 4.0)) == "neutral"
-    assert statistics.verdict(Estimate(2.0, -1.0, 4.0)) == "neutral"
-    assert statistics.verdict(Estimate(-2.0, -4.0, 0.0)) == "neutral"
-    assert statistics.verdict(Estimate(-2.0, -4.0, -0.1)) == "negative"
+def test_the_interval_of_five_better_runs_of_five_has_a_width():
+    low, high = np.arange(5.0), np.arange(5.0) + 10
+    value, low, high = statistics.improvement(high, low)
+    # 1 - t = 1.96 √(t (1 - t) (1 + 4 ((1 - t) / (2 - t) + t / (1 + t))) / 25), solved by hand.
+    factor = 1 + 4 * ((1 - low) / (2 - low) + low / (1 + low))
+    assert (value, high) == (1.0, 1.0) and 0.6 < low < 0.7
+    assert 1 - low == pytest.approx(1.959964 * math.sqrt(low * (1 - low) * factor / 25), rel=1e-4)
 
 
-def test_a_return_that_is_not_finite_gives_no_verdict():
-    change = statistics.difference(np.array([math.nan, 1.0]), np.array([1.0, 2.0]), draws())
-    assert math.isnan(change.value) and statistics.verdict(change) is None
-
-
-@pytest.mark.parametrize("shift, verdict", [(100, "positive"), (0, "neutral"), (-100, "negative")])
-def test_a_shift_beyond_the_spread_is_a_transfer(shift, verdict):
-    baseline = np.array([10.0, 14.0, 12.0])
-    change = statistics.difference(baseline + shift, baseline, draws())
-    assert change.value == shift and statistics.verdict(change) == verdict
-    assert math.isclose(change.high - shift, shift - change.low, abs_tol=1.0)
+@pytest.mark.parametrize("shift, spread", [(0.0, 1.0), (1.0, 1.0), (0.0, 3.0)])
+def test_intervals_of_the_probability_of_improvement_hold_the_truth_of_five_and_five(shift, spread):
+    random, held, trials = draws(5), 0, 600
+    truth = norm.cdf(shift / math.hypot(1.0, spread))
+    for _ in range(trials):
+        ours, base = shift + random.normal(size=5), spread * random.normal(size=5)
+        estimate = statistics.improvement(ours, base)
+        held += estimate.low <= truth <= estimate.high
+    assert 0.91 <= held / trials <= 0.99

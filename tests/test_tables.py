@@ -11,8 +11,9 @@ import envs
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from experiments.__main__ import main
-from experiments.cli import thesis
-from experiments.reports.outcomes import read_classification, read_outcomes
+from experiments.cli import reports, thesis
+from experiments.reports.classification import read_classification
+from experiments.reports.outcomes import read_outcomes
 from experiments.runs.folder import folders, latents_folder
 from experiments.thesis import grid, latent_tables
 from experiments.thesis.graph import plan_runs
@@ -46,7 +47,7 @@ def root(demo):
 def written(monkeypatch):
     """The tables and figures that were to be written, which here is only noted."""
     entries = []
-    monkeypatch.setattr(thesis, "_write", lambda some, *_: entries.extend(some))
+    monkeypatch.setattr(reports, "write_reports", lambda some, *_: entries.extend(some))
     return entries
 
 
@@ -114,7 +115,7 @@ def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(demo, root,
     assert written == [grid.DEMO, figure]
     assert metrics(root) == before
     outcomes = read_outcomes(root, [*shown(grid.DEMO, (0, 1)), *shown(figure, (0, 1))])
-    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}
 
 
 def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, tmp_path):
@@ -135,7 +136,7 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, 
     assert thesis._make([META], sweep) == 0
     assert len(targets.cells) == 2
     outcomes = read_outcomes(root, shown(META, (0, 1)))
-    assert {outcome.state for outcome in outcomes.values()} == {"complete"}
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}
     assert {row["label"] for row in read_metrics(root / targets.name)} == {"sources=2"}
 
 

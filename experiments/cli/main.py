@@ -15,7 +15,7 @@ import tyro
 
 from dreamer_jax.output import safe_output
 from dreamer_jax.ranges import check_ranges
-from experiments.cli import runs, sharing, thesis
+from experiments.cli import reports, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 from experiments.cli.options import Base, read_base
 
@@ -48,13 +48,14 @@ COMMANDS = {
     ),
     "evaluate": _plain(runs.Evaluate, runs.evaluate),
     "classify": _plain(runs.Classify, runs.classify),
-    "report": _plain(runs.Report, runs.report),
+    "report": _plain(reports.Report, reports.report),
     "verify": _plain(runs.Verify, runs.verify),
     "export": _plain(sharing.Export, sharing.export),
     "zoo": _plain(sharing.Zoo, sharing.zoo),
     "table": _plain(thesis.Tables, thesis.tables, thesis.table_defaults),
     "figure": _plain(thesis.Figures, thesis.figures, thesis.figure_defaults),
     "plan": _plain(thesis.Plan, thesis.plan, thesis.plan_defaults),
+    "seeds": _plain(reports.Seeds, reports.seeds),
     "demo": _plain(thesis.Demo, thesis.demo),
 }
 """All commands by name."""

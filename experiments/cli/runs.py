@@ -1,4 +1,4 @@
-"""Commands on one run: train, evaluate, classify, report. Their options, and what they do.
+"""Commands on one run: train, evaluate, classify. Their options, and what they do.
 
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
@@ -18,7 +18,7 @@ from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.ranges import setting
 from experiments import methods
-from experiments.cli.exits import FAILURE, STOPPED, UsageError, usage_errors
+from experiments.cli.exits import FAILURE, STOPPED, usage_errors
 from experiments.cli.options import (
     DEFAULT_PRESET,
     Base,
@@ -30,7 +30,6 @@ from experiments.cli.options import (
     method_summary,
     sequence,
 )
-from experiments.thesis.grid import SEEDS, Backend
 
 
 @dataclass(frozen=True)
@@ -179,24 +178,6 @@ class Classify:
 
 
 @dataclass(frozen=True)
-class Report:
-    """Print the table of a results folder and draw its learning curves.
-
-    Of several folders: of all of them beside each other. Of a folder of all results of a preset
-    (results/cpu): write all tables, figures and the page.
-    """
-
-    directories: tyro.conf.Positional[tuple[Path, ...]]
-    """The results folder, or several."""
-    out: Path = Path("comparison.png")
-    """Of several folders: the picture to draw; an .svg is written beside it."""
-    seeds: tuple[int, ...] = setting(SEEDS, 0, 2**31 - 1)
-    """Of all results: the seeds that tables and figures show."""
-    backend: Backend = "bullet"
-    """Of all results: the simulators."""
-
-
-@dataclass(frozen=True)
 class Verify:
     """Compare results folders with the checksums in them, and name what is damaged."""
 
@@ -206,6 +187,7 @@ class Verify:
 
 def train(command: Train) -> int:
     """Trains a population."""
+    from experiments.cli.reports import Report, report
     from experiments.runs.spec import RunSpec
 
     run = command.run
@@ -238,32 +220,6 @@ def train(command: Train) -> int:
         print(f"stopped and saved in {run.out}: the same command with --resume continues")
         return STOPPED
     return report(Report((run.out,)))
-
-
-def report(command: Report) -> int:
-    """Shows a run, several beside each other, or all results under a folder."""
-    from experiments.cli.thesis import report_all
-    from experiments.reports import summary
-    from experiments.runs.folder import run_folders
-
-    if not command.directories:
-        raise UsageError("nothing to report: name a results folder, or several")
-    if len(command.directories) > 1:
-        with usage_errors():
-            print(summary.table(summary.compare(command.directories)))
-            picture, _ = summary.plot_comparison(command.directories, command.out)
-        print(f"learning curves: {picture}")
-        return 0
-    (directory,) = command.directories
-    if not (directory / "run.json").exists() and run_folders(directory):
-        return report_all(directory, command.seeds, command.backend)
-    with usage_errors():
-        summaries = summary.summarise(directory)
-    print(summary.table(summaries))
-    if summary.evaluations(directory):
-        picture, _ = summary.plot_curves(directory)
-        print(f"learning curves: {picture}")
-    return 0
 
 
 def verify(command: Verify) -> int:

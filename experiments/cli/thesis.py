@@ -260,6 +260,7 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     """Trains what is missing and writes tables and figures."""
     from rich.progress import Progress
 
+    from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
     runs, progress = _carry_out(entries, sweep)
@@ -288,51 +289,14 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
                 )
         except ValueError as error:
             progress.failed[entry.name] = str(error)
-    _write(entries, sweep.root, sweep.seeds, sweep.backend)
+    write_reports(entries, sweep.root, sweep.backend, sweep.seeds)
     return _tell_problems(progress)
-
-
-def _write(
-    entries: Sequence[Table | Figure], root: Path, seeds: tuple[int, ...], backend: Backend
-) -> None:
-    """Writes tables, figures, and the page of all results under a root."""
-    from experiments.reports import page, publication
-    from experiments.runs.folder import report_folder
-
-    folder = report_folder(root, backend)
-    folder.mkdir(parents=True, exist_ok=True)
-    for entry in entries:
-        if isinstance(entry, Table):
-            print(publication.write_table(entry, root, seeds, folder) + "\n")
-            print(f"wrote {folder / entry.name}.txt, .csv, .png and .svg\n")
-        else:
-            for path in publication.write_figure(entry, root, seeds, folder):
-                print(f"wrote {path}")
-    print(f"wrote {page.write_page(root, seeds, backend, folder / 'index.html')}")
-
-
-def report_all(root: Path, seeds: tuple[int, ...], backend: Backend) -> int:
-    """Writes all tables and figures of which there is something, and the page. Trains nothing."""
-    from experiments.reports.outcomes import read_classification
-    from experiments.runs.folder import folders
-
-    held = folders(root)
-    entries = []
-    for entry in (*grid.TABLES.values(), *grid.FIGURES.values()):
-        entry = grid.on_backend(entry, backend)
-        if entry.kind == "ltc":
-            there = read_classification(root, entry, seeds) is not None
-        else:
-            there = any(cell.name in held for cell in grid.shown(entry, seeds))
-        if there:
-            entries.append(entry)
-    _write(entries, root, seeds, backend)
-    return 0
 
 
 def demo(command: Demo) -> int:
     """Runs the grid's entry of that name and shows what came of it."""
     from experiments.reports import summary
+    from experiments.reports.outcomes import read_run
     from experiments.runs import evaluate
     from experiments.runs.folder import folders
 
@@ -349,13 +313,14 @@ def demo(command: Demo) -> int:
     places = folders(sweep.root)
     for folder in dict.fromkeys(places[cell.name][0] for cell in grid.shown(grid.DEMO, (0, 1))):
         evaluate.evaluate(evaluate.load_agents(folder), 1, video=True, workers=sweep.workers)
-        pictures = summary.plot_curves(folder)
+        run = read_run(folder)
+        pictures = summary.plot_curves(run)
         if (folder / "transfer.txt").exists():
             print("\nWhat was transferred, leaf by leaf (norms are means over the targets)\n")
             print((folder / "transfer.txt").read_text())
         title = grid.DEMO.targets[0]
         print(f"Return of evaluation episodes on {title}, mean ± standard deviation\n")
-        print(summary.table(summary.summarise(folder)))
+        print(summary.table(summary.summarise(run)))
         for path in (*pictures, *sorted((folder / "videos").glob("*.mp4"))):
             print(f"wrote {path}")
     print("\n" + _scale(configs.preset(command.preset)))

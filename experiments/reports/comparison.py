@@ -2,7 +2,8 @@
 
 Returns are those of the evaluations (section 4.2.3): "overall" takes all evaluations of a run,
 "final" those in the last tenth of its environment steps. A run's score is their mean. Numbers are
-given for entries all of whose runs are complete, and for no others.
+those of the seeds that are done; a verdict takes five of them on either side, and is corrected for
+the number of comparisons in its table (see `verdicts`).
 
 Axis letters: N runs (seeds), E evaluations.
 """
@@ -13,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.reports import statistics
-from experiments.reports.outcomes import Outcome
+from experiments.reports import statistics, verdicts
+from experiments.reports.outcomes import Outcome, curves
 from experiments.reports.statistics import Estimate
+from experiments.reports.verdicts import Verdict
 from experiments.thesis import grid, published
-from experiments.thesis.grid import Cell, Metric, Table
+from experiments.thesis.grid import Cell, Table
 from experiments.thesis.published import Published
 
 # Intervals are the same whenever and in whatever order tables are written.
@@ -32,16 +34,21 @@ class Transfer:
       difference: mean score less the baseline's.
       improvement: probability that a run beats one of the baseline.
       jumpstart: mean return of the first evaluations, less the baseline's.
+      chance: probability of a difference as large without an effect, corrected for the number of
+        comparisons in the table; None where either side has fewer than five seeds.
     """
 
     difference: Estimate
     improvement: Estimate
     jumpstart: float
+    chance: float | None = None
 
     @property
-    def verdict(self) -> statistics.Verdict | None:
-        """Positive, neutral or negative transfer; None where there is no interval to judge by."""
-        return statistics.verdict(self.difference)
+    def verdict(self) -> Verdict | None:
+        """Positive or negative transfer, or undecided; None where there are too few seeds."""
+        if self.chance is None:
+            return None
+        return verdicts.verdict(self.difference.value, self.chance)
 
 
 @dataclass(frozen=True)
@@ -66,12 +73,12 @@ class Entry:
       sources: number of source tasks; None for the baseline.
       omega: the fraction of equation 19, if any.
       outcomes: of each seed.
-      planned: evaluations that the seeds make together; 0 if none of the table has begun.
+      seeds: of the outcomes.
       published: the thesis's entry, if it has one.
-      scores: [N], of complete entries.
-      ours: mean and deviation of returns, of complete entries.
-      average: interquartile mean of the scores, of complete entries.
-      transfer: against the baseline, where both are complete.
+      scores: [N], of the seeds that are done.
+      ours: mean and deviation of their returns, if there are any.
+      average: interquartile mean of the scores.
+      transfer: against the baseline, where seeds of both are done.
       threshold: likewise, and of the baseline itself.
     """
 
@@ -79,7 +86,7 @@ class Entry:
     sources: int | None
     omega: float | None
     outcomes: tuple[Outcome, ...]
-    planned: int
+    seeds: tuple[int, ...]
     published: Published | None
     scores: tuple[float, ...] = ()
     ours: tuple[float, float] | None = None
@@ -89,13 +96,28 @@ class Entry:
 
     @property
     def done(self) -> int:
-        """Evaluations made by all seeds."""
-        return sum(len(outcome.env_steps) for outcome in self.outcomes)
+        """Evaluations made by all seeds that have begun and not failed."""
+        return sum(len(outcome.env_steps) for outcome in self._sound)
 
     @property
-    def complete(self) -> bool:
-        """Whether all seeds have made all their evaluations."""
-        return all(outcome.state == "complete" for outcome in self.outcomes)
+    def planned(self) -> int:
+        """Evaluations that these seeds will have made."""
+        return sum(outcome.planned for outcome in self._sound)
+
+    @property
+    def failed(self) -> tuple[int, ...]:
+        """The seeds that failed."""
+        return self._seeds("failed")
+
+    @property
+    def cut(self) -> tuple[int, ...]:
+        """The seeds that have begun and are not done."""
+        return self._seeds("cut")
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything of it has been evaluated."""
+        return any(outcome.state != "missing" for outcome in self.outcomes)
 
     @property
     def name(self) -> str:
@@ -103,26 +125,18 @@ class Entry:
         words = ["baseline"] if self.sources is None else [f"{self.sources} tasks"]
         return ", ".join(words + ([] if self.omega is None else [f"ω = {self.omega:g}"]))
 
+    @property
+    def full_name(self) -> str:
+        """Which entry it is of any table."""
+        return f"{self.target}, {self.name}"
 
-def curves(outcomes: Sequence[Outcome], task: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns on a task over environment steps, as far as all runs that have begun have come.
+    @property
+    def _sound(self) -> list[Outcome]:
+        return [outcome for outcome in self.outcomes if outcome.state in ("cut", "done")]
 
-    Returns:
-      environment steps [E] and returns [N, E]; N is 0 if no run has begun.
-    """
-    begun = [outcome for outcome in outcomes if outcome.env_steps]
-    if not begun:
-        return np.zeros(0, int), np.zeros((0, 0))
-    length = min(len(outcome.returns.get(task, ())) for outcome in begun)
-    steps = np.array(begun[0].env_steps[:length])
-    return steps, np.array([outcome.returns[task][:length] for outcome in begun], float)
-
-
-def _chosen(outcome: Outcome, task: str, metric: Metric) -> np.ndarray:
-    returns = np.asarray(outcome.returns[task], float)
-    if metric == "overall":
-        return returns
-    return statistics.final(outcome.env_steps, returns, outcome.total_env_steps)
+    def _seeds(self, state: str) -> tuple[int, ...]:
+        pairs = zip(self.seeds, self.outcomes, strict=True)
+        return tuple(seed for seed, outcome in pairs if outcome.state == state)
 
 
 def keys(table: Table) -> list[tuple[str, int | None, float | None]]:
@@ -156,57 +170,91 @@ def compare(
       outcomes: of all cells that the table shows.
       seeds: of targets and baselines; the first one is the sources'.
     """
-    groups = {
-        key: tuple(outcomes[cell] for cell in cells(table, key, seeds)) for key in keys(table)
-    }
-    planned = max(outcome.planned for group in groups.values() for outcome in group)
     entries: dict[tuple, Entry] = {}
-    for key, group in groups.items():
+    for key in keys(table):
+        group = tuple(outcomes[cell] for cell in cells(table, key, seeds))
         base = entries.get((key[0], None, None))
-        entries[key] = _entry(table, key, group, planned * len(seeds), base)
-    return entries
+        entries[key] = _entry(table, key, group, tuple(seeds), base)
+    return _with_verdicts(entries)
 
 
-def _entry(table, key, outcomes, planned: int, base: Entry | None) -> Entry:
+def transferred(table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]) -> bool:
+    """Whether anything of a table of returns but its agents from scratch has begun."""
+    return any(
+        outcomes[cell].state != "missing"
+        for key in keys(table)
+        if key[1] is not None
+        for cell in cells(table, key, seeds)
+    )
+
+
+def _entry(table, key, outcomes, seeds, base: Entry | None) -> Entry:
     target = key[0]
-    empty = Entry(*key, outcomes, planned, published.returns(published.number(table), *key))
-    if not empty.complete:
+    empty = Entry(*key, outcomes, seeds, published.returns(published.number(table), *key))
+    done = [outcome for outcome in outcomes if outcome.state == "done"]
+    if not done:
         return empty
-    chosen = [_chosen(outcome, target, table.metric) for outcome in outcomes]
-    scores = np.array([returns.mean() for returns in chosen])
+    scores = np.array([outcome.score(target, table.metric) for outcome in done])
+    returns = np.concatenate([outcome.chosen(target, table.metric) for outcome in done])
     entry = dataclasses.replace(
         empty,
         scores=tuple(scores.tolist()),
-        ours=statistics.mean_and_deviation(np.concatenate(chosen)),
+        ours=statistics.mean_and_deviation(returns),
         average=statistics.aggregate([scores], np.random.default_rng(DRAWS_SEED)),
     )
     if base is None:
-        return dataclasses.replace(entry, threshold=_threshold(outcomes, outcomes, target))
-    if not base.complete:
+        return dataclasses.replace(entry, threshold=_threshold(done, done, target))
+    if not base.scores:
         return entry
-    reference = np.array(base.scores)
-    count = statistics.first_evaluations(outcomes[0].planned)
+    baselines = [outcome for outcome in base.outcomes if outcome.state == "done"]
+    count = statistics.first_evaluations(done[0].planned)
     transfer = Transfer(
-        statistics.difference(scores, reference, np.random.default_rng(DRAWS_SEED)),
-        statistics.improvement([(scores, reference)], np.random.default_rng(DRAWS_SEED)),
-        statistics.jumpstart(curves(outcomes, target)[1], curves(base.outcomes, target)[1], count),
+        Estimate(scores.mean() - np.mean(base.scores), None, None),
+        statistics.improvement(scores, np.array(base.scores)),
+        statistics.jumpstart(curves(done, target)[1], curves(baselines, target)[1], count),
     )
-    threshold = _threshold(outcomes, base.outcomes, target)
+    threshold = _threshold(done, baselines, target)
     return dataclasses.replace(entry, transfer=transfer, threshold=threshold)
 
 
-def _threshold(outcomes, baselines, target: str) -> Threshold:
+def _with_verdicts(entries: dict[tuple, Entry]) -> dict[tuple, Entry]:
+    """Intervals of the differences, of each target's groups together, and what they say."""
+    chances: dict[tuple, float] = {}
+    found = dict(entries)
+    for target in dict.fromkeys(entry.target for entry in entries.values()):
+        chosen = [key for key in entries if key[0] == target and entries[key].transfer]
+        if not chosen:
+            continue
+        base = entries[target, None, None].scores
+        groups = [np.array(entries[key].scores) for key in chosen]
+        differences = verdicts.differences(groups, np.array(base))
+        for key, value, low, high, chance in zip(chosen, *differences, strict=True):
+            ends = (float(low), float(high)) if np.isfinite(low) else (None, None)
+            transfer = dataclasses.replace(
+                entries[key].transfer, difference=Estimate(float(value), *ends)
+            )
+            found[key] = dataclasses.replace(entries[key], transfer=transfer)
+            if min(len(base), len(entries[key].scores)) >= verdicts.LEAST_SEEDS:
+                chances[key] = float(chance)
+    corrected = verdicts.holm(np.array(list(chances.values())))
+    for key, chance in zip(chances, corrected, strict=True):
+        transfer = dataclasses.replace(found[key].transfer, chance=float(chance))
+        found[key] = dataclasses.replace(found[key], transfer=transfer)
+    return found
+
+
+def _threshold(done: Sequence[Outcome], baselines: Sequence[Outcome], target: str) -> Threshold:
     count = statistics.first_evaluations(baselines[0].planned)
     _, base = curves(baselines, target)
-    late = [_chosen(outcome, target, "final").mean() for outcome in baselines]
+    late = [outcome.score(target, "final") for outcome in baselines]
     value = statistics.threshold(float(base[:, :count].mean()), float(np.mean(late)))
-    steps, returns = curves(outcomes, target)
+    steps, returns = curves(done, target)
     return Threshold(value, statistics.time_to_threshold(steps, returns.mean(0), value))
 
 
 @dataclass(frozen=True)
 class Aggregate:
-    """One setting of a method over all targets that are complete.
+    """One setting of a method over all targets all of whose entries are there.
 
     Attributes:
       name: of the setting.
@@ -230,8 +278,8 @@ def across_targets(
       tables: entries of tables of one method and metric, from `compare`.
 
     Returns:
-      The targets all of whose entries are complete, and one aggregate for each setting of the
-      method, the baseline first; none without a target.
+      The targets all of whose entries have seeds that are done, and one aggregate for each setting
+      of the method, the baseline first; none without a target.
     """
     by_target: dict[str, dict[tuple, Entry]] = {}
     for entries in tables:
@@ -240,7 +288,7 @@ def across_targets(
     by_target = {
         target: group
         for target, group in by_target.items()
-        if all(entry.complete for entry in group.values())
+        if all(entry.scores for entry in group.values())
     }
     if not by_target:
         return [], []
@@ -258,7 +306,7 @@ def across_targets(
             Aggregate(
                 entry.name,
                 statistics.aggregate(strata, np.random.default_rng(DRAWS_SEED)),
-                statistics.improvement(pairs, np.random.default_rng(DRAWS_SEED))
+                statistics.mean_improvement(pairs, np.random.default_rng(DRAWS_SEED))
                 if entry.sources is not None
                 else None,
             )

@@ -1,7 +1,4 @@
-"""Pictures: learning curves as in Figures 12 to 39, the tasks as in 10 and 11, and tables.
-
-Curves are the mean over seeds of an evaluation's return, with their standard deviation shaded.
-"""
+"""Pictures: learning curves as in Figures 12 to 39, the tasks as in 10 and 11, and tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,8 +7,8 @@ from pathlib import Path
 import gymnasium
 
 import envs
-from experiments.reports import comparison
-from experiments.reports.levels import draw_levels
+from experiments.reports import curves
+from experiments.reports.curves import FORMATS
 from experiments.reports.outcomes import Outcome
 from experiments.thesis import grid
 from experiments.thesis.grid import Cell, Figure
@@ -19,13 +16,13 @@ from experiments.thesis.populations import task_name
 
 TRANSFER, BASELINE = "tab:blue", "tab:green"
 """The thesis's colours."""
-FORMATS = (".png", ".svg")
+VERDICTS = {"positive": "#d6efd8", "undecided": "#eeeeee", "negative": "#f9d9d6"}
+"""Behind the words for a transfer."""
 PICTURE_SIZE = 256
-DOTS_PER_INCH = 110
 
 
 @dataclass(frozen=True)
-class Curve:
+class Line:
     """One line of a panel.
 
     Attributes:
@@ -46,12 +43,12 @@ class Panel:
     Attributes:
       title: what sets it apart from the others.
       task: title of the task whose returns are drawn.
-      curves: the lines.
+      lines: its curves.
     """
 
     title: str
     task: str
-    curves: tuple[Curve, ...]
+    lines: tuple[Line, ...]
 
 
 def panels(figure: Figure, seeds: Sequence[int]) -> tuple[Panel, ...]:
@@ -60,14 +57,12 @@ def panels(figure: Figure, seeds: Sequence[int]) -> tuple[Panel, ...]:
 
     def baseline(task):
         cells = tuple(grid.baseline(backend, task, seed) for seed in seeds)
-        return Curve("baseline", BASELINE, cells)
+        return Line("baseline", BASELINE, cells)
 
     if figure.kind == "baselines":
         return tuple(Panel(task, task, (baseline(task),)) for task in figure.tasks)
     if figure.kind == "multitask":
-        agent = Curve(
-            "multi-task agent", TRANSFER, (grid.multitask(backend, figure.tasks, source),)
-        )
+        agent = Line("multi-task agent", TRANSFER, (grid.multitask(backend, figure.tasks, source),))
         return tuple(Panel(task, task, (agent, baseline(task))) for task in figure.tasks)
     (task,) = figure.tasks
     if figure.kind == "ftl":
@@ -86,7 +81,7 @@ def panels(figure: Figure, seeds: Sequence[int]) -> tuple[Panel, ...]:
             for count in figure.counts
         }
     return tuple(
-        Panel(title, task, (Curve("transfer", TRANSFER, cells), baseline(task)))
+        Panel(title, task, (Line("transfer", TRANSFER, cells), baseline(task)))
         for title, cells in transfers.items()
     )
 
@@ -112,6 +107,17 @@ def _joined(names: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}"
 
 
+def begun(
+    figure: Figure, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
+) -> tuple[Panel, ...]:
+    """The panels of a figure that show something: not those of a baseline beside nothing."""
+    return tuple(
+        panel
+        for panel in panels(figure, seeds)
+        if any(outcomes[cell].env_steps for cell in panel.lines[0].cells)
+    )
+
+
 def draw_curves(
     figure: Figure,
     outcomes: Mapping[Cell, Outcome],
@@ -120,7 +126,9 @@ def draw_curves(
     stem: Path,
     formats: Sequence[str] = FORMATS,
 ) -> list[Path]:
-    """Draws learning curves; those of incomplete runs as far as they go, labelled with counts.
+    """Draws learning curves; those of runs that were cut as far as they go, labelled with counts.
+
+    Panels of which nothing was run are left out and named below the title.
 
     Args:
       figure: any but the pictures of the tasks.
@@ -131,59 +139,32 @@ def draw_curves(
       formats: suffixes of the files.
 
     Returns:
-      The files written.
+      The files written; none if nothing of the figure was run.
     """
-    pyplot = _pyplot()
-    shown = panels(figure, seeds)
-    columns = 2 if len(shown) == 4 else min(3, len(shown))
-    rows = -(-len(shown) // columns)
+    shown = begun(figure, outcomes, seeds)
+    if not shown:
+        return []
+    left_out = [p.title for p in panels(figure, seeds) if p.title not in {s.title for s in shown}]
+    title = caption(figure) + ("" if size is None else f"\n({size})")
+    title += f"\nnot run: {', '.join(left_out)}" if left_out else ""
+    drawn = [
+        curves.Panel(
+            panel.title,
+            [task_name(figure.backend, panel.task)],
+            [
+                curves.Curve(
+                    line.label,
+                    [outcomes[cell] for cell in line.cells],
+                    panel.task,
+                    {"color": line.colour},
+                )
+                for line in panel.lines
+            ],
+        )
+        for panel in shown
+    ]
     one_task = len({panel.task for panel in shown}) == 1
-    picture, axes = pyplot.subplots(
-        rows,
-        columns,
-        figsize=(4.2 * columns, 3.2 * rows + 0.5),
-        squeeze=False,
-        sharey=one_task,
-        layout="constrained",
-    )
-    for axis, panel in zip(axes.flat, shown, strict=False):
-        for curve in panel.curves:
-            _draw_curve(axis, curve, panel.task, [outcomes[cell] for cell in curve.cells])
-        draw_levels(axis, [task_name(figure.backend, panel.task)])
-        axis.set_title(panel.title)
-        axis.grid(alpha=0.3)
-        axis.legend(frameon=False, fontsize="small")
-        axis.xaxis.set_major_formatter("{x:,.0f}")
-        axis.xaxis.set_major_locator(pyplot.MaxNLocator(4))
-    picture.suptitle(caption(figure) + ("" if size is None else f"\n({size})"))
-    picture.supxlabel("environment steps")
-    picture.supylabel("return of an evaluation episode")
-    return _save(pyplot, picture, stem, formats)
-
-
-def _draw_curve(axis, curve: Curve, task: str, outcomes: Sequence[Outcome]) -> None:
-    label = curve.label + state(outcomes)
-    steps, returns = comparison.curves(outcomes, task)
-    if not len(steps):
-        axis.plot([], [], color=curve.colour, linestyle=":", label=label)
-        return
-    complete = all(outcome.state == "complete" for outcome in outcomes)
-    mean, deviation = returns.mean(0), returns.std(0)
-    style = {"color": curve.colour, "linestyle": "-" if complete else "--"}
-    # A single evaluation is no line yet.
-    axis.plot(steps, mean, label=label, marker="o" if len(steps) == 1 else None, **style)
-    axis.fill_between(
-        steps, mean - deviation, mean + deviation, color=curve.colour, alpha=0.2, linewidth=0
-    )
-
-
-def state(outcomes: Sequence[Outcome]) -> str:
-    """What a label adds for runs that are not complete."""
-    if all(outcome.state == "complete" for outcome in outcomes):
-        return ""
-    done = sum(len(outcome.env_steps) for outcome in outcomes)
-    planned = max(outcome.planned for outcome in outcomes) * len(outcomes)
-    return f", incomplete: {done} of {planned} evaluations" if done else ", not run"
+    return curves.draw_panels(drawn, stem, title=title, share_returns=one_task, formats=formats)
 
 
 def draw_tasks(
@@ -203,7 +184,7 @@ def draw_tasks(
     Raises:
       ModuleNotFoundError: the simulator is not installed.
     """
-    pyplot = _pyplot()
+    pyplot = curves.pyplot_without_display()
     count = len(figure.tasks)
     picture, axes = pyplot.subplots(
         1, count, figsize=(3.0 * count, 3.5), squeeze=False, layout="constrained"
@@ -220,14 +201,13 @@ def draw_tasks(
         # The frame stays: the background of some is as white as the page.
         axis.set_xticks([])
         axis.set_yticks([])
-    return _save(pyplot, picture, stem, formats)
+    return curves.save(picture, stem, formats)
 
 
 def draw_table(
     title: str,
     header: Sequence[str],
     rows: Sequence[Sequence],
-    colours: Mapping[str, str],
     stem: Path,
 ) -> list[Path]:
     """Draws a table.
@@ -235,24 +215,28 @@ def draw_table(
     Args:
       title: above it.
       header: names of the columns.
-      rows: for each the name and then, for each column, None or a text and a verdict or None.
-      colours: behind places with a verdict, whose word is written too.
+      rows: for each the name and then, for each column, None or a text and a verdict or None,
+        which is written below it.
       stem: where to, without suffix.
 
     Returns:
       The files written, PNG and SVG.
     """
-    pyplot = _pyplot()
+    pyplot = curves.pyplot_without_display()
     texts, shades = [], []
     for name, *places in rows:
         places = [place or ("", None) for place in places]
         texts.append([name, *(f"{text}\n{word}" if word else text for text, word in places)])
-        shades.append(["white", *(colours.get(word, "white") for _, word in places)])
+        shades.append(["white", *(VERDICTS.get(word, "white") for _, word in places)])
     columns = list(zip(header, *texts, strict=True))
     widths = [max(len(line) for text in column for line in text.split("\n")) for column in columns]
-    height = 0.42 * (len(rows) + 1)
-    picture = pyplot.figure(figsize=(0.085 * sum(widths) + 0.25 * len(widths), height + 0.5))
-    axis = picture.add_axes((0.01, 0.01, 0.98, height / (height + 0.5)))
+    # Two lines of a place need more than one.
+    height = 0.24 * sum(max(text.count("\n") + 2 for text in row) for row in [header, *texts])
+    width = max(5.0, 0.085 * sum(widths) + 0.25 * len(widths))
+    title = curves.wrapped(title, width)
+    top = 0.25 * (title.count("\n") + 1) + 0.1
+    picture = pyplot.figure(figsize=(width, height + top))
+    axis = picture.add_axes((0.01, 0.01, 0.98, height / (height + top)))
     axis.set_axis_off()
     drawn = axis.table(
         cellText=texts,
@@ -268,22 +252,4 @@ def draw_table(
         place.set_edgecolor("#bbbbbb")
         place.set_text_props(weight="bold" if row == 0 else "normal")
     picture.suptitle(title, fontsize=11)
-    return _save(pyplot, picture, stem, FORMATS)
-
-
-def _pyplot():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
-def _save(pyplot, picture, stem: Path, formats: Sequence[str]) -> list[Path]:
-    # Not with_suffix, which would take what follows a point in the name for one.
-    paths = [stem.with_name(stem.name + suffix) for suffix in formats]
-    for path in paths:
-        picture.savefig(path, dpi=DOTS_PER_INCH)
-    pyplot.close(picture)
-    return paths
+    return curves.save(picture, stem)

@@ -2,19 +2,21 @@
 
 After "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (Agarwal et al.,
 2021): a run gives one score, and intervals come from drawing runs anew within each task. Pure
-functions over NumPy arrays; those that draw take a generator.
+functions over NumPy arrays; those that draw take a generator. Differences to a baseline and what
+they say of a transfer are in `verdicts`.
 
 Axis letters: N runs (seeds) of one task, D draws of the bootstrap, E evaluations.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
-CONFIDENCE = 0.95
+from experiments.reports.verdicts import CONFIDENCE
+
 DRAWS = 2000
 FINAL_SHARE = 0.1
 """Share of a run's environment steps, at its end, whose evaluations are the final ones."""
@@ -22,8 +24,6 @@ FIRST_SHARE = 0.05
 """Share of a run's evaluations, at its start, that a jumpstart compares."""
 REACHED_SHARE = 0.9
 """How far from a baseline's first to its final return the threshold lies whose time is taken."""
-
-Verdict = Literal["positive", "neutral", "negative"]
 
 
 class Estimate(NamedTuple):
@@ -92,32 +92,38 @@ def aggregate(strata: Sequence[np.ndarray], generator: np.random.Generator) -> E
     return bootstrap(strata, statistic, generator)
 
 
-def difference(one: np.ndarray, other: np.ndarray, generator: np.random.Generator) -> Estimate:
-    """Mean score of one group less that of another, with its interval."""
-
-    def statistic(one, other, axis):
-        return one.mean(axis=axis) - other.mean(axis=axis)
-
-    return bootstrap([one, other], statistic, generator)
-
-
-def verdict(change: Estimate) -> Verdict | None:
-    """What an interval of the difference to the baseline says of a transfer (section 2.4.1).
-
-    "positive" or "negative" if 0 lies outside of the interval, "neutral" if not; None without an
-    interval.
-    """
-    if change.low is None:
-        return None
-    return "positive" if change.low > 0 else "negative" if change.high < 0 else "neutral"
-
-
-def improvement(
-    pairs: Sequence[tuple[np.ndarray, np.ndarray]], generator: np.random.Generator
-) -> Estimate:
+def improvement(ours: np.ndarray, baseline: np.ndarray, confidence: float = CONFIDENCE) -> Estimate:
     """Probability that a run beats one of the baseline, equal ones counted half.
 
-    The statistic of Mann and Whitney over the number of pairs of runs, averaged over tasks.
+    The statistic of Mann and Whitney over the number of pairs of runs. Its interval is the fifth
+    of Newcombe (2006), which has a width where all runs of one side are better, too: of five and
+    five runs it held the truth in 93 to 97 % of cases (normal with spreads alike and four times,
+    exponential, and agents some of which learn).
+
+    Args:
+      ours, baseline: scores [N].
+      confidence: of the interval.
+    """
+    ours, baseline = np.asarray(ours, float), np.asarray(baseline, float)
+    value = float(_wins(ours, baseline))
+    if len(ours) < 2 or len(baseline) < 2:
+        return Estimate(value, None, None)
+    pairs, more = len(ours) * len(baseline), (len(ours) + len(baseline)) / 2 - 1
+    reach = float(stats.norm.ppf((1 + confidence) / 2))
+
+    def beyond(truth: float) -> float:
+        factor = 1 + more * ((1 - truth) / (2 - truth) + truth / (1 + truth))
+        return abs(value - truth) - reach * math.sqrt(truth * (1 - truth) * factor / pairs)
+
+    low = 0.0 if value == 0 else optimize.brentq(beyond, 0.0, value - 1e-9)
+    high = 1.0 if value == 1 else optimize.brentq(beyond, value + 1e-9, 1.0)
+    return Estimate(value, float(low), float(high))
+
+
+def mean_improvement(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]], generator: np.random.Generator
+) -> Estimate:
+    """Probability of improvement averaged over tasks, with its bootstrap interval.
 
     Args:
       pairs: for each task, scores [N] of the runs and of the baseline's.
@@ -125,14 +131,16 @@ def improvement(
     """
 
     def statistic(*scores, axis):
-        shares = []
-        for ours, base in zip(scores[::2], scores[1::2], strict=True):
-            ours, base = ours[..., :, None], base[..., None, :]
-            wins = (ours > base) + 0.5 * (ours == base)
-            shares.append(wins.mean(axis=(-2, -1)))
-        return np.mean(shares, axis=0)
+        tasks = zip(scores[::2], scores[1::2], strict=True)
+        return np.mean([_wins(ours, base) for ours, base in tasks], axis=0)
 
     return bootstrap([scores for pair in pairs for scores in pair], statistic, generator)
+
+
+def _wins(ours: np.ndarray, baseline: np.ndarray) -> np.ndarray:
+    """Share of pairs of runs [..., N] that the first of both wins."""
+    ours, baseline = ours[..., :, None], baseline[..., None, :]
+    return ((ours > baseline) + 0.5 * (ours == baseline)).mean(axis=(-2, -1))
 
 
 def normalised(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -147,16 +155,21 @@ def normalised(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [(np.asarray(group, float) - lowest) / (highest - lowest) for group in groups]
 
 
-def final(env_steps: Sequence[int], returns: Sequence[float], total: int) -> np.ndarray:
-    """The returns of the evaluations in the last tenth of a run; the last one if none lies there.
+def final(
+    env_steps: Sequence[int], returns: Sequence[float], total: int, planned: int
+) -> np.ndarray:
+    """The returns of a run's final evaluations: those in its last tenth, and the last one planned.
+
+    A run that was cut before them has none.
 
     Args:
       env_steps: environment steps [E] at each evaluation.
       returns: of each evaluation [E].
       total: environment steps of the whole run.
+      planned: evaluations of the whole run.
     """
     late = np.asarray(env_steps) > (1 - FINAL_SHARE) * total
-    late[-1:] = True
+    late[planned - 1 : planned] = True
     return np.asarray(returns, float)[late]
 
 
