@@ -36,6 +36,9 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
+    compared: tuple[Literal["fine-tuning", "frozen-source"], ...] = ()
+    """Other methods to train, too, from the same sources, for rows of their own in tables of
+    fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
@@ -155,7 +158,7 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    return _make(entries, command.sweep)
+    return _make([_beside(entry, command.sweep) for entry in entries], command.sweep)
 
 
 def figures(command: Figures) -> int:
@@ -170,6 +173,13 @@ def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
     omegas = tuple(omega for omega in entry.omegas if omega in sweep.omegas)
     counts = tuple(count for count in entry.counts if count in sweep.counts)
     return dataclasses.replace(entry, omegas=omegas, counts=counts)
+
+
+def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
+    """A table of fractional transfer with the methods of comparison that are asked for."""
+    if isinstance(entry, Table) and entry.kind == "ftl":
+        return dataclasses.replace(entry, compared=sweep.compared)
+    return entry
 
 
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
@@ -237,7 +247,7 @@ def plan(command: Plan) -> int:
             *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
             *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
         ]
-    runs = _planned(entries, sweep)
+    runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
     due = [run for run in runs if run.state in ("missing", "cut")]
     speed = None
     if due:
