@@ -83,13 +83,6 @@ def test_on_another_backend_no_agent_is_shared():
     assert len(here) == len(there) and not here & there
 
 
-def test_the_demo_is_a_part_of_table_7():
-    part, whole = (cells_of([entry], seeds=(0, 1)) for entry in (grid.DEMO, TABLES["table-7"]))
-    assert set(part) < set(whole)
-    # A source, three fractions of two seeds, and two baselines.
-    assert len(part) == 1 + 6 + 2
-
-
 def test_methods_of_comparison_are_rows_where_they_were_asked_for_or_are_there():
     table = TABLES["table-3"]
     whole = dataclasses.replace(table, compared=grid.COMPARED)

@@ -309,14 +309,6 @@ def test_tasks_of_one_title_are_told_apart_by_their_names(tasks, called):
     assert [row.split()[:2] for row in rows] == [["seed", name] for name in called]
 
 
-def test_the_demo_is_a_table_too(tmp_path):
-    root = tmp_path / "debug"
-    write_folder(root, "all", [*targets(grid.DEMO.omegas, SEEDS), *baselines(SEEDS)], rising)
-    text = publication.write_table(grid.DEMO, root, SEEDS, tmp_path / "out")
-    assert text.startswith("Demo: InvertedPendulum, overall return")
-    assert "120 ± 12 | 856 ± 121" in text
-
-
 def test_settings_that_are_not_the_presets_are_named(tmp_path):
     root = tmp_path / "cpu"
 

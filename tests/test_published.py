@@ -186,8 +186,7 @@ def test_the_bound_on_deviations_of_three_holds_and_is_reached():
     assert deviation == pytest.approx(math.sqrt(2) * (1 - mean))
 
 
-def test_the_demo_stands_beside_the_table_that_it_is_a_part_of():
-    assert published.number(grid.DEMO) == 7
+def test_a_table_stands_beside_the_one_of_its_name():
     assert published.number(grid.on_backend(grid.TABLES["table-12"], "brax")) == 12
     strange = dataclasses.replace(grid.TABLES["table-1"], name="table-18")
     with pytest.raises(ValueError, match="the thesis has no table-18, its tables are table-1, "):

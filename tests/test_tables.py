@@ -24,23 +24,23 @@ pytest.importorskip("pybullet")
 
 SOURCE = "bullet-HalfCheetah+InvertedDoublePendulum-seed-0"
 TARGETS = "bullet-InvertedPendulum-fractional"
+PART = ["table", "7", "--preset", "debug", "--seeds", "0", "1", "--counts", "2"]
+PART += ["--omegas", "0", "0.2", "0.4"]
+TABLE = dataclasses.replace(TABLES["table-7"], counts=(2,), omegas=(0.0, 0.2, 0.4))
 META = dataclasses.replace(TABLES["table-16"], targets=("InvertedPendulum",), counts=(2,))
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    """The folder of results of a demo, and what it printed."""
+def made(tmp_path_factory):
+    """The folder of results in which a part of Table 7 was made."""
     results = tmp_path_factory.mktemp("results")
-    with pytest.MonkeyPatch.context() as patch:
-        lines = []
-        patch.setattr("builtins.print", lambda *words, **_: lines.append(" ".join(map(str, words))))
-        assert main(["demo", "--preset", "debug", "--results", str(results)]) == 0
-    return results, "\n".join(lines)
+    assert main([*PART, "--results", str(results)]) == 0
+    return results
 
 
 @pytest.fixture(scope="module")
-def root(demo):
-    return demo[0] / "debug"
+def root(made):
+    return made / "debug"
 
 
 @pytest.fixture
@@ -55,36 +55,12 @@ def metrics(root):
     return {path.parent.name: path.read_bytes() for path in root.glob("*/metrics.jsonl")}
 
 
-def test_the_demo_prints_its_table_report_and_scale(demo):
-    results, output = demo
-    for label in ("omega=0", "omega=0.2", "omega=0.4", "baseline"):
-        assert any(line.startswith(label) and "±" in line for line in output.splitlines())
-    assert "reward/out/kernel" in output
-    assert "fraction(omega=0..0.4)" in output
-    assert "the machinery, not the effect" in output
-    members = {row["member"] for row in read_metrics(results / "debug" / TARGETS)}
-    assert members == set(range(8))
-
-
-def test_the_demo_writes_pictures_and_videos(demo):
-    results, output = demo
-    for name in (
-        "curves.png",
-        "curves.svg",
-        "videos/evaluate_bullet_inverted_pendulum.mp4",
-        "videos/prediction_bullet_inverted_pendulum.mp4",
-    ):
-        file = results / "debug" / TARGETS / name
-        assert file.stat().st_size > 1000
-        assert str(file) in output
-
-
-def test_the_demo_run_again_repeats_nothing(demo, root, capsys):
+def test_a_table_made_again_repeats_nothing(made, root, capsys):
     before = metrics(root)
-    assert main(["demo", "--preset", "debug", "--results", str(demo[0])]) == 0
+    assert main([*PART, "--results", str(made)]) == 0
     assert metrics(root) == before
     output = capsys.readouterr().out
-    assert "baseline" in output and "begins" not in output
+    assert "Table 7: InvertedPendulum, overall return" in output and "begins" not in output
 
 
 def test_what_was_transferred_is_written_leaf_by_leaf(root):
@@ -107,20 +83,20 @@ def test_runs_say_where_their_sources_are_from_the_folder_of_all(root):
     assert len(read_json(root / TARGETS / "cells.json")) == 8
 
 
-def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(demo, root, written):
+def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(made, root, written):
     before = metrics(root)
-    sweep = thesis.Sweep("debug", (0, 1), results=demo[0], config=CONFIG)
+    sweep = thesis.Sweep("debug", (0, 1), results=made, config=CONFIG)
     figure = dataclasses.replace(grid.FIGURES["figure-36"], tasks=("InvertedPendulum",))
-    assert thesis._make([grid.DEMO, figure], sweep) == 0
-    assert written == [grid.DEMO, figure]
+    assert thesis._make([TABLE, figure], sweep) == 0
+    assert written == [TABLE, figure]
     assert metrics(root) == before
-    outcomes = read_outcomes(root, [*shown(grid.DEMO, (0, 1)), *shown(figure, (0, 1))])
+    outcomes = read_outcomes(root, [*shown(TABLE, (0, 1)), *shown(figure, (0, 1))])
     assert {outcome.state for outcome in outcomes.values()} == {"done"}
 
 
-def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(demo, written, tmp_path):
+def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(made, written, tmp_path):
     root = tmp_path / "debug"
-    shutil.copytree(demo[0] / "debug", root)
+    shutil.copytree(made / "debug", root)
     runs = plan_runs(shown(META, (0, 1)), CONFIG, root)
     *sources, targets = [run for run in runs if run.state == "missing"]
     # Made in a moment: what is trained here is the population of targets.
@@ -206,21 +182,21 @@ def test_damaged_samples_are_named_with_the_way_out(classified, tmp_path):
         latent_tables.make_table(tmp_path / "debug", TABLES["table-13"], 0)
 
 
-def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(demo, capsys):
+def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, capsys):
     words = ["plan", "--table", "7", "--preset", "debug", "--seeds", "0", "1"]
-    assert main([*words, "--results", str(demo[0])]) == 0
+    assert main([*words, "--results", str(made)]) == 0
     output = capsys.readouterr().out
     assert f"{TARGETS} " in output and f"{TARGETS}-2" in output
     assert "cut" not in output and "missing" in output and "done" in output
     assert "An estimate" in output
-    assert set(folders(demo[0] / "debug")) == set(
-        read_json(demo[0] / "debug" / SOURCE / "cells.json")
-        + read_json(demo[0] / "debug" / TARGETS / "cells.json")
+    assert set(folders(made / "debug")) == set(
+        read_json(made / "debug" / SOURCE / "cells.json")
+        + read_json(made / "debug" / TARGETS / "cells.json")
     )
 
 
-def test_results_of_another_preset_are_refused_with_the_difference(demo, tmp_path, capsys):
-    shutil.copytree(demo[0] / "debug", tmp_path / "demo")
+def test_results_of_another_preset_are_refused_with_the_difference(made, tmp_path, capsys):
+    shutil.copytree(made / "debug", tmp_path / "demo")
     words = ["table", "7", "--preset", "demo", "--results", str(tmp_path)]
     assert main(words) == 2
     assert "learning.batch_size: 2 / 8" in capsys.readouterr().err

@@ -15,7 +15,7 @@ import tyro
 
 from dreamer_jax.output import safe_output
 from dreamer_jax.ranges import check_ranges
-from experiments.cli import reports, runs, sharing, thesis
+from experiments.cli import demo, reports, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 from experiments.cli.options import Base, read_base
 
@@ -56,7 +56,7 @@ COMMANDS = {
     "figure": _plain(thesis.Figures, thesis.figures, thesis.figure_defaults),
     "plan": _plain(thesis.Plan, thesis.plan, thesis.plan_defaults),
     "seeds": _plain(reports.Seeds, reports.seeds),
-    "demo": _plain(thesis.Demo, thesis.demo),
+    "demo": _plain(demo.Demo, demo.demo),
 }
 """All commands by name."""
 

@@ -50,6 +50,8 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
@@ -210,9 +212,9 @@ def train(command: Train) -> int:
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.workers,
+            accept_failed=run.accept_failed,
             timeout=run.simulator_timeout,
             from_checkpoint=run.from_checkpoint,
-            accept_failed=run.accept_failed,
         )
     if spec.method.needs:
         print((run.out / "transfer.txt").read_text())

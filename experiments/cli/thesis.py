@@ -1,4 +1,4 @@
-"""Commands on the thesis's grid: table, figure, plan, demo. Their options, and what they do.
+"""Commands on the thesis's grid: table, figure, plan. Their options, and what they do.
 
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
@@ -9,7 +9,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -91,18 +90,6 @@ class Plan:
     figure: tuple[str, ...] = ()
     """Numbers of figures (10 to 39), or all."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
-
-
-@dataclass(frozen=True)
-class Demo:
-    """The main job in minutes: a part of Table 7, with a source of two tasks and two seeds."""
-
-    results: Path = Path("results")
-    """The folder of all results; the demo's are in one of its preset's name."""
-    preset: Literal["demo", "debug"] = "demo"
-    """debug runs the same in seconds."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
 
 
 def _sweep(base: Base) -> Sweep:
@@ -301,50 +288,3 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
             progress.failed[entry.name] = str(error)
     write_reports(entries, sweep.root, sweep.backend, sweep.seeds)
     return _tell_problems(progress)
-
-
-def demo(command: Demo) -> int:
-    """Runs the grid's entry of that name and shows what came of it."""
-    from experiments.reports import summary
-    from experiments.reports.outcomes import read_run
-    from experiments.runs import evaluate
-    from experiments.runs.folder import folders
-
-    sweep = Sweep(
-        command.preset,
-        seeds=(0, 1),
-        results=command.results,
-        workers=command.workers,
-        config=configs.preset(command.preset),
-    )
-    _, progress = _carry_out([grid.DEMO], sweep)
-    if not progress.complete:
-        return STOPPED if progress.stopped else _tell_problems(progress)
-    places = folders(sweep.root)
-    for folder in dict.fromkeys(places[cell.name][0] for cell in grid.shown(grid.DEMO, (0, 1))):
-        evaluate.evaluate(evaluate.load_agents(folder), 1, video=True, workers=sweep.workers)
-        run = read_run(folder)
-        pictures = summary.plot_curves(run)
-        if (folder / "transfer.txt").exists():
-            print("\nWhat was transferred, leaf by leaf (norms are means over the targets)\n")
-            print((folder / "transfer.txt").read_text())
-        title = grid.DEMO.targets[0]
-        print(f"Return of evaluation episodes on {title}, mean ± standard deviation\n")
-        print(summary.table(summary.summarise(run)))
-        for path in (*pictures, *sorted((folder / "videos").glob("*.mp4"))):
-            print(f"wrote {path}")
-    print("\n" + _scale(configs.preset(command.preset)))
-    return 0
-
-
-def _scale(config: configs.Config) -> str:
-    """A plain word on what runs of this size can show."""
-    from dreamer_jax.schedule import Schedule
-
-    schedule = Schedule(config.schedule, tasks=1)
-    return (
-        "This demo shows the machinery, not the effect. Its agents are small, and a target makes "
-        f"{schedule.updates:,} updates\non {schedule.environment_steps(schedule.rounds):,} "
-        "environment steps, where one of the thesis makes about 100,000 on 1,000,000. None has "
-        "learned its task:\nthe differences between the rows above are noise."
-    )

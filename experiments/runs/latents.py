@@ -134,7 +134,7 @@ def gather(
                 ticks=source.spec.config.schedule.phase_ticks,
                 mode="random" if policy == "random" else "evaluate",
             )
-            records = to_host(records).at(0)
+            records = to_host(records).map(lambda x: x[0])
             env.check()
             missing = agent.action_size - acting.action_size
             action = np.pad(records.action, ((0, 0), (0, 0), (0, missing)))

@@ -197,9 +197,6 @@ FIGURES = {
 }
 """Figures 10 to 39 by name. Figures 1 to 9 are diagrams."""
 
-DEMO = Table("demo", "ftl", ("InvertedPendulum",), "overall", counts=(2,), omegas=(0.0, 0.2, 0.4))
-"""A part of Table 7 that is done in minutes, with seeds 0 and 1."""
-
 
 def baseline(backend: Backend, task: str, seed: int) -> Cell:
     """An agent from scratch on one task."""

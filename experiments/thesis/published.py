@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from dreamer_jax.files import read_json
-from experiments.thesis.grid import DEMO, TABLES, Table
+from experiments.thesis.grid import TABLES, Table
 
 PATH = Path(__file__).with_name("published.json")
 COPIES = (4, 6, 8, 12)
@@ -62,11 +62,10 @@ def records() -> tuple[Published, ...]:
 
 
 def number(table: Table) -> int:
-    """The number of the thesis's table with the same targets and metric: 7 for the demo, too."""
-    name = "table-7" if table.name == DEMO.name else table.name
-    if name not in TABLES:
+    """The number of the thesis's table with the same name."""
+    if table.name not in TABLES:
         raise ValueError(f"the thesis has no {table.name}, its tables are {', '.join(TABLES)}")
-    return int(name.removeprefix("table-"))
+    return int(table.name.removeprefix("table-"))
 
 
 @functools.cache
