@@ -50,8 +50,6 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
-    accept_failed: bool = False
-    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""

@@ -35,9 +35,9 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
-    compared: tuple[Literal["fine-tuning", "frozen-source"], ...] = ()
-    """Other methods to train, too, from the same sources, for rows of their own in tables of
-    fractional transfer."""
+    compared: tuple[str, ...] = ()
+    """Other methods to train, too, from the same sources (any of fine-tuning, frozen-source), for
+    rows of their own in tables of fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
@@ -182,6 +182,8 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
+        if not set(sweep.compared) <= set(grid.COMPARED):
+            raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
         entries = [_restricted(entry, sweep) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
         return plan_runs(cells, sweep.config, sweep.root)
