@@ -181,6 +181,10 @@ class ScheduleConfig:
     replay_keep: int | None = setting(None, 1, 10**12)
     """Newest records of each task that are sampled, older ones being deleted from the disk; none
     given: all of them."""
+    replay: Literal["auto", "files", "device"] = "auto"
+    """Where updates take records from. Files; or a copy of them in the device's memory, with which
+    a round is one program, if the environment has no host. auto: the device on an accelerator,
+    where that takes at most half of its memory; else files."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
     """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
     mapping_chunk: int = setting(1, 1, 10**6)

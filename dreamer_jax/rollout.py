@@ -67,7 +67,7 @@ def collect(
     *,
     tasks: int,
     ticks: int,
-    mode: Mode,
+    mode: Mode | jax.Array,
 ) -> Records:
     """One phase of every task by every member, all simulators in step.
 
@@ -82,12 +82,13 @@ def collect(
       phase: int32 [], number of the phase.
       tasks: K.
       ticks: T.
-      mode: "random" (prefill), "explore" or "evaluate" (the mode, without noise).
+      mode: "random" (prefill), "explore" or "evaluate" (the mode, without noise); or its index in
+        `MODES`, int32 [].
 
     Returns:
       Records with leading axes [P, K, T + 1].
     """
-    number = jnp.int32(MODES.index(mode))
+    number = jnp.int32(MODES.index(mode)) if isinstance(mode, str) else mode
     return _collect(agent, env, params, seeds, updates, phase, number, tasks=tasks, ticks=ticks)
 
 

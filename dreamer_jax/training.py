@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer_jax.agent import Agent, Mode
+from dreamer_jax.device_round import DeviceRounds, on_device
 from dreamer_jax.diagnosis import diagnose, warnings
 from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
@@ -64,13 +65,13 @@ class StopRequest:
     A context manager; outside the main thread it does nothing, as Python allows no more.
 
     Args:
-      notify: is told of the request in words.
+      say: is told of the request in words.
       hurry: called at the request, so that nothing that hangs is waited for.
     """
 
-    def __init__(self, notify: Callable[[str], None], hurry: Callable[[], None]):
+    def __init__(self, say: Callable[[str], None], hurry: Callable[[], None]):
         self.requested = False
-        self._notify, self._hurry = notify, hurry
+        self._say, self._hurry = say, hurry
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -89,7 +90,7 @@ class StopRequest:
             raise KeyboardInterrupt
         self.requested = True
         self._hurry()
-        self._notify("stopping: saving first (once more to quit without)")
+        self._say("stopping: saving first (once more to quit without)")
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -162,6 +163,9 @@ class Run:
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
+        self._one_program, self._replay_note = on_device(
+            agent, getattr(env, "has_host", True), len(self.tasks), len(self.members)
+        )
         self.videos = videos
         self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
         self.folder = RunFolder(
@@ -187,6 +191,10 @@ class Run:
     def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
         """Takes up what the folder holds, or else the state given, or else fresh agents."""
         agent = self.agent
+        # Where rounds are one program each; None where updates read the files.
+        self.device_rounds = (
+            DeviceRounds(agent, self.env, self.replay, self.seeds) if self._one_program else None
+        )
         self.counters = Counters()
         self.state = init_members(agent, self.seeds) if state is None else state
         if self.state.updates.shape != (len(self.members),):
@@ -195,12 +203,16 @@ class Run:
             )
         learning = agent.config.learning
         self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
-        found = self.folder.restore({"agent": self.state, "sums": self.sums}, from_checkpoint)
+        self._restore(from_checkpoint)
+        self._warned: set[tuple[int, str]] = set()
+
+    def _restore(self, step: int | None = None) -> None:
+        """Goes back to a checkpoint, by default the newest, if there is one."""
+        found = self.folder.restore({"agent": self.state, "sums": self.sums}, step)
         if found is not None:
             self.state, self.sums = found[0]["agent"], found[0]["sums"]
             self.counters = Counters(**found[1])
         self._healthy = np.array(self.state.healthy)
-        self._warned: set[tuple[int, str]] = set()
 
     def save(self) -> None:
         """Writes a checkpoint of everything that a resumed run needs."""
@@ -228,6 +240,8 @@ class Run:
             self._progress_bar() as self._bar,
             StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
+            if self._replay_note:
+                self._bar.message(self._replay_note)
             if self.checkpoints.latest() is None:
                 self.save()
             saved_steps = schedule.environment_steps(self.counters.rounds)
@@ -243,7 +257,7 @@ class Run:
                     elif action == "evaluate":
                         self._evaluate()
                     else:
-                        self._collect("random" if action == "prefill" else "explore")
+                        self._round("random" if action == "prefill" else "explore")
                 except (KeyboardInterrupt, NonFiniteError):
                     raise
                 except Exception as error:
@@ -251,7 +265,7 @@ class Run:
                     self.save()
                     if not stop.requested:
                         raise
-                    self._bar.message(f"this phase is given up: {error}")
+                    self._bar.message(f"this phase is given up: {error}")  # type: ignore[unreachable]
                     return "stopped"
             self.save()
         return "finished" if action == "done" else "stopped"
@@ -306,10 +320,37 @@ class Run:
         self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
-    def _collect(self, mode: Literal["random", "explore"]) -> None:
+    def _round(self, mode: Literal["random", "explore"]) -> None:
+        """Collects, and in one program with that makes the updates that are then due, if rounds
+        are one program each."""
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
+        if self.device_rounds is None:
+            self._commit(self._phase(mode, self.counters.rounds), mode)
+            return
+        started, rounds = time.perf_counter(), self.counters.rounds
+        updates = range(self.counters.updates, self.schedule.updates_due(rounds + 1))
+        try:
+            self.state, self.sums, records = self.device_rounds.run(
+                self.state, self.sums, rounds, updates, mode
+            )
+            self.env.check()
+            check_records(records, self.tasks)
+            self._time("round", started, updates=len(updates))
+            self._commit(records, mode)
+        except Exception:
+            # The agents from before the round are used up.
+            self.device_rounds.forget()
+            self._restore()
+            raise
+        if updates:
+            averaged = self.counters.averaged + len(updates)
+            self._advance(updates=updates.stop, averaged=averaged)
+            self._bar.update(updates=updates.stop)
+            self._write_averages()
+
+    def _commit(self, records: Records, mode: Literal["random", "explore"]) -> None:
+        """Writes a phase to the replay, and what it brought to the metrics."""
         rounds = self.counters.rounds
-        records = self._phase(mode, rounds)
         self.replay.append(records)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
@@ -335,9 +376,10 @@ class Run:
         self._bar.update(phase="updating")
         learning, schedule = self.agent.config.learning, self.schedule.config
         due = self.schedule.updates_due(self.counters.rounds)
-        started, before, loss = time.perf_counter(), self.counters.updates, None
+        started, before = time.perf_counter(), self.counters.updates
+        loss: jax.Array | None = None
         with self.replay.batches(
-            np.asarray(self.seeds),
+            np.asarray(self.seeds).tolist(),
             range(before, due),
             learning.batch_size,
             learning.sequence_length,
@@ -353,20 +395,19 @@ class Run:
                     chunk=schedule.mapping_chunk,
                 )
                 # One update ahead of the device, no more: the next batch is being prepared.
-                if previous is not None:
-                    previous.block_until_ready()
+                jax.block_until_ready(previous)
                 self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
                 self._bar.update(updates=update + 1)
                 if stop.requested:
                     break
-        loss.block_until_ready()
+        jax.block_until_ready(loss)
         self._time("update", started, updates=self.counters.updates - before)
         if self.counters.updates == due:
             self._write_averages()
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
-        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy))
+        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy)).tolist()
         self._healthy = np.array(self.state.healthy)
         for member in range(len(self.members)):
             averages = {name: float(x[member]) / count for name, x in sums.items()}

@@ -49,6 +49,11 @@ class TaskSpec:
     supersample: int = 1
     renderer: str = ""
 
+    @property
+    def has_host(self) -> bool:
+        """Whether a simulator or a renderer of it runs on the host."""
+        return self.renderer != "jax"
+
 
 class TimeStep(NamedTuple):
     """What one tick of an environment gives. Every leaf gets the leading axes of a `vmap`.
@@ -80,11 +85,14 @@ class Env(Protocol):
         action_size: A, the largest |A| of the tasks; smaller tasks read their first |A| entries.
         image_size: height and width of the images in pixels.
         discrete: True if actions are one-hot vectors of length A; False for continuous ones.
+        has_host: False if all of it is part of the jitted program; True if anything, simulators or
+            renderers, runs on the host.
     """
 
     action_size: int
     image_size: int
     discrete: bool
+    has_host: bool
 
     def reset(self, slot: Any, key: Any) -> tuple[Any, TimeStep]:
         """Put a new simulator, seeded by `key`, into `slot` (int32 []).

@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.brax_chain import Chain
 from envs.brax_physics import Physics, brax_state, quiet
 
 # isort: split
 # After the module above, which keeps what Brax says on import to itself.
-from brax import actuator, kinematics
+from brax import actuator
+from brax.base import Inertia, Motion, Transform
 from brax.generalized import constraint, dynamics, integrator, mass
 
 
@@ -66,97 +68,145 @@ class Episodes:
 
 
 class _Held(NamedTuple):
-    """A state of the generalized engine.
+    """States of the generalized engine, as much of each as the next step needs.
 
     Attributes:
-        physics: Brax's state.
-        stale: bool [], only positions, velocities and poses are known yet.
+        q: float32 [n, Q], joint positions.
+        qd: float32 [n, D], joint velocities.
+        inverse: float32 [n, D, D], of the mass matrix, as the last step knew it.
+        positions: float32 [n, L, 3], of links.
+        quaternions: float32 [n, L, 4].
+        new: bool [n], no step was made: the inverse is not known.
     """
 
-    physics: Any
-    stale: jax.Array
+    q: jax.Array
+    qd: jax.Array
+    inverse: jax.Array
+    positions: jax.Array
+    quaternions: jax.Array
+    new: jax.Array
 
 
 class GeneralizedEpisodes(Episodes):
     """Episodes in Brax's generalized engine, whose step is written out once.
 
-    Brax has the same chain of operations at the end of a step as in the making of a new state: from
-    positions and velocities to all that the next step needs. Here new starts go through the
-    chain of the step, in a pass of its own that is made only if there are any.
+    Brax ends a step, and the making of a state, with all that the next step needs. Here a step
+    begins with that, so that positions, velocities and the inverse of the mass matrix are all
+    that passes from one to the next, and a start needs no more than a draw of these.
     """
 
     def __init__(self, physics: Physics, repeat: int):
         super().__init__(physics, repeat)
         self._system, self._env = physics.env.sys, physics.env
+        self._chain = Chain(self._system)
         empty = jax.eval_shape(physics.start, jax.random.key(0))
         self._empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
 
     def begin(self, keys: jax.Array) -> _Held:
-        def one(key):
-            state = self._drawn(key)
-            x, xd = kinematics.forward(self._system, state.q, state.qd)
-            return _Held(state.replace(x=x, xd=xd), jnp.bool_(True))
+        return self._placed(self._starts(keys))
 
-        return jax.vmap(one)(keys)
+    def _starts(self, keys: jax.Array) -> _Held:
+        """Where n episodes start, the places of links not known yet."""
+        drawn = jax.vmap(self._drawn)(keys)
+        return _held(drawn, jnp.ones(len(drawn.q), bool))
+
+    def _placed(self, states: _Held) -> _Held:
+        """States with the places of links as their joints say."""
+        places = self._chain.places(states.q)
+        return states._replace(positions=places.positions, quaternions=places.quaternions)
 
     def physics_state(self, state: _Held) -> Any:
-        return state.physics
+        def one(state):
+            places = Transform(state.positions, state.quaternions)
+            return self._empty.replace(q=state.q, qd=state.qd, x=places, mass_mx_inv=state.inverse)
+
+        return jax.vmap(one)(state)
 
     def tick(self, states, actions, ended, keys):
-        before = jax.lax.cond(
-            ended.any(),
-            lambda: _chosen(ended, jax.vmap(self._drawn)(keys), states.physics),
-            lambda: states.physics,
+        # Starts are not moved, but placed by the steps of the others.
+        states = jax.lax.cond(
+            ended.any(), lambda: _chosen(ended, self._starts(keys), states), lambda: states
         )
-        new = ended | states.stale
         actions = jnp.clip(actions, -1.0, 1.0)
-        commands = jax.vmap(self._command)(before, actions)
+        commands = jax.vmap(self._command)(self.physics_state(states), actions)
 
-        def environment_step(carry, index):
+        def environment_step(carry, _):
             before, rewards, over = carry
-            first = jnp.where((index == 0) & new.any(), -1, 0)
 
-            def physics_step(number, state):
-                moved = self._physics_step(state, commands, number < 0)
-                return _chosen(jnp.where(number < 0, new, ~over & ~ended), moved, state)
+            def physics_step(_, state):
+                moved = self._physics_step(state, commands)
+                return _chosen(over | ended, state, moved)
 
-            after = jax.lax.fori_loop(first, self._env._n_frames, physics_step, before)
-            judged, reward, terminal = jax.vmap(self._outcome)(before, after, actions)
-            # A start is no step to be judged.
-            after = _chosen(ended, after, judged)
-            return (after, rewards + jnp.where(over, 0.0, reward), over | terminal), None
+            after = jax.lax.fori_loop(0, self._env._n_frames, physics_step, before)
+            after = self._placed(after)
+            judged, reward, terminal = jax.vmap(self._outcome)(
+                self.physics_state(before), self.physics_state(after), actions
+            )
+            kept = _chosen(ended, after, _held(judged, after.new))
+            return (kept, rewards + jnp.where(over, 0.0, reward), over | terminal), None
 
         nothing = jnp.zeros(len(ended))
         with quiet():
             (after, rewards, over), _ = jax.lax.scan(
-                environment_step, (before, nothing, nothing != 0), jnp.arange(self._repeat)
+                environment_step, (states, nothing, nothing != 0), None, self._repeat
             )
-        stale = jnp.zeros_like(ended)
-        return _Held(after, stale), jnp.where(ended, 0.0, rewards), over & ~ended
+        return after, jnp.where(ended, 0.0, rewards), over & ~ended
 
-    def _physics_step(self, states, commands, starting):
-        """One physics step of n states; or, if `starting`, what follows from where they are."""
+    def _physics_step(self, states: _Held, commands: jax.Array) -> _Held:
+        """One physics step of n states."""
         system = self._system
+        places = self._chain.places(states.q)
+        motions = self._chain.motions(places, states.qd)
+        links = len(system.link_parents)
+
+        def known(state, place, motion):
+            return self._empty.replace(
+                q=state.q,
+                qd=state.qd,
+                x=Transform(place.positions, place.quaternions),
+                root_com=jnp.tile(motion.centre, (links, 1)),
+                cinr=Inertia(
+                    # The quaternions of inertias are not looked at.
+                    Transform(motion.moments, jnp.zeros((links, 4))),
+                    motion.inertia,
+                    system.link.inertia.mass,
+                ),
+                cd=Motion(motion.link_turns, motion.link_moves),
+                cdof=Motion(motion.turns, motion.moves),
+                cdofd=Motion(motion.turns_rate, motion.moves_rate),
+                mass_mx_inv=state.inverse,
+            )
 
         def moved(state, command):
+            state = constraint.jacobian(system, state)
             torques = actuator.to_tau(system, command, state.q, state.qd)
-            new = state.replace(qf_smooth=dynamics.forward(system, state, torques))
-            new = new.replace(qf_constraint=constraint.force(system, new))
-            return integrator.integrate(system, new)
+            state = state.replace(qf_smooth=dynamics.forward(system, state, torques))
+            state = state.replace(qf_constraint=constraint.force(system, state))
+            return integrator.integrate(system, state)
 
-        def placed(state):
-            x, xd = kinematics.forward(system, state.q, state.qd)
-            return dynamics.transform_com(system, state.replace(x=x, xd=xd))
+        before = jax.vmap(known)(states, places, motions)
+        before = self._inverted(before, states.new)
+        after = jax.vmap(moved)(before, commands)
+        return _held(after, jnp.zeros_like(states.new))
 
-        states = _where(starting, states, jax.vmap(moved)(states, commands))
-        states = jax.vmap(placed)(states)
-        states = jax.lax.cond(
-            starting,
-            jax.vmap(lambda state: mass.matrix_inv(system, state, 0)),
-            jax.vmap(lambda state: mass.matrix_inv(system, state, system.matrix_inv_iterations)),
-            states,
-        )
-        return jax.vmap(lambda state: constraint.jacobian(system, state))(states)
+    def _inverted(self, states, new: jax.Array):
+        """States with their mass matrices and the inverses of these: made better from those of the
+        step before, but those of the new ones made from nothing."""
+        matrices = jax.vmap(lambda state: mass.matrix(self._system, state))(states)
+
+        def exact():
+            identity = jnp.broadcast_to(jnp.eye(matrices.shape[1]), matrices.shape)
+            return jax.scipy.linalg.solve(matrices, identity, assume_a="pos")
+
+        steps = self._system.matrix_inv_iterations
+        if steps:
+            inverses = improved_inverses(matrices, states.mass_mx_inv, new, steps)
+            inverses = jax.lax.cond(
+                new.any(), lambda: _chosen(new, exact(), inverses), lambda: inverses
+            )
+        else:
+            inverses = exact()
+        return states.replace(mass_mx=matrices, mass_mx_inv=inverses)
 
     # What Brax's environment adds to its engine, found out by standing in for the engine.
 
@@ -197,6 +247,60 @@ def _standing_in(env, **methods: Callable):
     return env
 
 
+_EXACT = 1e-6
+"""What an inverse times its matrix may be off the identity by (Frobenius norm): float32 knows no
+better, and Newton's next step after 1e-3 is there."""
+
+
+def improved_inverses(matrices, inverses, known: jax.Array, steps: int) -> jax.Array:
+    """Inverses of matrices [n, D, D], by Newton's method from those of nearby matrices.
+
+    Brax makes the same steps (Schulz's), and all of them whether or not they change anything.
+
+    Args:
+        matrices: symmetric, positive definite.
+        inverses: of matrices near them.
+        known: bool [n], which need no inverse.
+        steps: how many are made at most.
+    """
+    identity = jnp.eye(matrices.shape[1])
+
+    def off(inverses):
+        rest = identity - matrices @ inverses
+        return rest, jnp.sqrt(jnp.square(rest).sum((1, 2)))
+
+    rest, error = off(inverses)
+    # Far from the inverse there is a start from which the steps lead to it.
+    far = (error > 1)[:, None, None]
+    scale = jnp.square(matrices).sum((1, 2))[:, None, None]
+    inverses = jnp.where(far, 0.5 * matrices / scale, inverses)
+
+    def step(carry):
+        count, inverses, rest, error, _ = carry
+        better = inverses + inverses @ rest
+        new_rest, new_error = off(better)
+        closer = new_error < error
+        chosen = closer[:, None, None]
+        going = closer & (new_error > _EXACT) & ~known
+        return (
+            count + 1,
+            jnp.where(chosen, better, inverses),
+            jnp.where(chosen, new_rest, rest),
+            jnp.where(closer, new_error, error),
+            going,
+        )
+
+    rest, error = off(inverses)
+    going = (error > _EXACT) & ~known
+    start = (0, inverses, rest, error, going)
+    return jax.lax.while_loop(lambda carry: (carry[0] < steps) & carry[-1].any(), step, start)[1]
+
+
+def _held(state, new: jax.Array) -> _Held:
+    """What is held of n of Brax's states."""
+    return _Held(state.q, state.qd, state.mass_mx_inv, state.x.pos, state.x.rot, new)
+
+
 def _chosen(chosen: jax.Array, new, old):
     """Leaves [n, ...] of `new` where `chosen` (bool [n]), else of `old`."""
 
@@ -204,7 +308,3 @@ def _chosen(chosen: jax.Array, new, old):
         return jnp.where(chosen.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
     return jax.tree.map(one, new, old)
-
-
-def _where(condition: jax.Array, new, old):
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)

@@ -69,6 +69,7 @@ class BraxEnv:
     """
 
     discrete = False
+    has_host = False
 
     def __init__(
         self,
@@ -202,6 +203,8 @@ class HostDrawnBraxEnv(BraxEnv):
         ValueError: for an image size that is too small.
         SimulatorError: if there is nothing to draw with, and what to install.
     """
+
+    has_host = True
 
     def __init__(
         self,

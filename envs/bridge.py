@@ -103,6 +103,8 @@ class HostEnv:
         timeout: seconds after which a simulator that does not answer is given up.
     """
 
+    has_host = True
+
     def __init__(
         self,
         tasks: Sequence[TaskSpec],

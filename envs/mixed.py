@@ -43,6 +43,7 @@ class MixedEnv:
         self.parts = tuple(parts)
         self.members = members
         self.image_size, self.action_size = parts[0].image_size, parts[0].action_size
+        self.has_host = any(part.has_host for part in parts)
         self._tasks = sum(map(len, places))
         # For each task, its environment and its number there.
         self._part_of = [0] * self._tasks

@@ -22,6 +22,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import envs
+from dreamer_jax import device_replay
+from dreamer_jax.agent import Agent
+from dreamer_jax.config import preset
+from dreamer_jax.device_round import whole_round
+from dreamer_jax.population import init_members, zero_sums
 from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
 from envs.mixed import MixedEnv
@@ -282,6 +287,74 @@ def test_a_state_that_is_not_finite_ends_the_episode_before_it(brax_physics):
     assert same(after, before)
 
 
+@pytest.mark.parametrize("title", ["Hopper", "Ant"])
+def test_links_are_where_brax_has_them_and_move_as_there(brax_physics, title):
+    """A chain of slides and hinges, and a free root with branches, at random."""
+    from brax import kinematics
+    from brax.generalized import base, dynamics
+
+    from envs.brax_chain import Chain
+
+    system = brax_physics.physics_of(title, "generalized").env.sys
+    chain, keys = Chain(system), jax.random.split(jax.random.key(0))
+    # A root's quaternion is not of length 1 then.
+    q = system.init_q + 0.5 * jax.random.normal(keys[0], (3, system.q_size()))
+    qd = jax.random.normal(keys[1], (3, system.qd_size()))
+
+    @jax.jit
+    @jax.vmap
+    def brax(q, qd):
+        x, xd = kinematics.forward(system, q, qd)
+        return dynamics.transform_com(system, base.State.init(q, qd, x, xd))
+
+    @jax.jit
+    def ours(q, qd):
+        places = chain.places(q)
+        return places, chain.motions(places, qd)
+
+    state, (places, motions) = brax(q, qd), ours(q, qd)
+    pairs = (
+        (places.positions, state.x.pos),
+        (places.quaternions, state.x.rot),
+        (motions.centre[:, None], state.root_com[:, :1]),
+        (motions.moments, state.cinr.transform.pos),
+        (motions.inertia, state.cinr.i),
+        (motions.turns, state.cdof.ang),
+        (motions.moves, state.cdof.vel),
+        (motions.link_turns, state.cd.ang),
+        (motions.link_moves, state.cd.vel),
+        (motions.turns_rate, state.cdofd.ang),
+        (motions.moves_rate, state.cdofd.vel),
+    )
+    for one, other in pairs:
+        np.testing.assert_allclose(one, other, atol=2e-5)
+
+
+def test_trees_of_other_kinds_are_refused(brax_physics):
+    from envs.brax_chain import Chain
+
+    system = brax_physics.physics_of("Hopper", "generalized").env.sys
+    with pytest.raises(ValueError, match="links 31f1 with .*expected one root, free or with"):
+        Chain(system.replace(link_types="31f1"))
+
+
+def test_inverses_are_improved_until_nothing_is_gained(brax_physics):
+    from envs.brax_episodes import improved_inverses
+
+    random = np.random.default_rng(0)
+    roots = random.normal(size=(4, 5, 5)).astype(np.float32)
+    matrices = roots @ roots.swapaxes(1, 2) + 2 * np.eye(5, dtype=np.float32)
+    exact = np.linalg.inv(matrices)
+    # Near the inverse, far from it, known already, and between.
+    starts = np.float32([exact[0] * 1.01, exact[1] * 40, exact[2] * 9, exact[3] * 1.2])
+    known = np.array([False, False, True, False])
+    found = np.asarray(improved_inverses(matrices, starts, known, 30))
+    np.testing.assert_allclose(found[~known], exact[~known], rtol=1e-4, atol=1e-5)
+    once = np.asarray(improved_inverses(matrices[:1], starts[:1], known[:1], 1))
+    np.testing.assert_allclose(once, exact[:1], atol=2e-4)
+    assert np.abs(once - exact[:1]).max() < np.abs(starts[:1] - exact[:1]).max()
+
+
 @pytest.mark.parametrize("title", ["InvertedPendulum"])
 def test_a_step_written_out_once_is_brax_own(brax_physics, title):
     """Starts, held actions and new starts, against Brax's functions one after another. Falls are
@@ -337,10 +410,11 @@ events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 env = envs.make([SWINGUP], members=2, image_size=16)
 run = phase_of(env, tasks=1, ticks=30)
-events.clear()
 leaves = jax.tree.leaves(run(0))
 print(hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest())
 print("from disk:", "/jax/compilation_cache/cache_hits" in events)
+# What is not found there, and takes as long as is worth keeping.
+print("compiled:", "/jax/compilation_cache/cache_misses" in events)
 """
 
 
@@ -348,6 +422,29 @@ def test_both_renderers_show_the_same_phase(env, hosted):
     one, other = (phase_of(made, tasks=1, ticks=10)(0)[1] for made in (env, hosted))
     np.testing.assert_allclose(one.reward, other.reward, atol=1e-4)
     assert psnr(one.image, other.image).mean() > 35
+
+
+def test_environments_say_whether_they_have_a_host(env, hosted):
+    assert not env.has_host and hosted.has_host
+    assert MixedEnv([env, hosted], [[0], [1]], 2).has_host
+    assert not MixedEnv([env, env], [[0], [1]], 2).has_host
+
+
+def test_a_whole_round_of_several_tasks_is_one_program_without_a_host(brax_pixels):
+    """P = 2 members of K = 2 tasks: collecting, storing, sampling and updating."""
+    agent = Agent(preset("debug"), 1)
+    made = envs.make([SWINGUP, "brax/inverted_double_pendulum"], members=2, image_size=32)
+    state = jax.eval_shape(lambda: init_members(agent, jnp.arange(2)))
+    sums = jax.eval_shape(lambda: zero_sums(agent, state, 2, 5))
+    held = jax.eval_shape(lambda: device_replay.empty(2, 2, 42, 32, 1))
+    drawn = jax.ShapeDtypeStruct((4, 2, 2), jnp.int32)
+    number = jax.ShapeDtypeStruct((), jnp.int32)
+    program = whole_round.lower(
+        agent, made, state, sums, held, jnp.arange(2), number, number, number, (drawn, drawn),
+        ticks=20, length=5, mapping="auto", chunk=1,
+    ).as_text()  # fmt: skip
+    assert "callback" not in program and program.count("func.func public") == 1
+    assert "jax.buffer_donor" in program or "tf.aliasing_output" in program
 
 
 def test_no_host_is_part_of_a_phase(env, hosted):
@@ -373,10 +470,11 @@ def test_a_phase_is_the_same_in_a_fresh_process_which_finds_it_on_disk(env):
         [sys.executable, "-c", FRESH_PROCESS],
         capture_output=True,
         text=True,
-        env=os.environ | {"PYTHONPATH": paths},
+        env=os.environ | {"PYTHONPATH": paths, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "2"},
     )
     expected = hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest()
-    assert fresh.stdout.splitlines() == [expected, "from disk: True"], fresh.stderr
+    lines = [expected, "from disk: True", "compiled: False"]
+    assert fresh.stdout.splitlines() == lines, fresh.stderr
 
 
 @pytest.fixture
@@ -612,6 +710,17 @@ def test_bodies_are_where_pybullet_shows_them(drawing, title):
 
 
 # Gymnasium
+
+
+def test_the_pendulums_known_levels_are_what_constant_actions_bring(brax_pixels):
+    levels = dict(envs.spec(SWINGUP).levels)
+    simulator = brax_pixels.BraxSimulator("InvertedPendulum", 32, "generalized", "jax")
+    for name, action in (("no action", 0.0), ("constant action", 1.0)):
+        simulator.reset(seed=3)
+        total = sum(simulator.step(np.array([action])).reward for _ in range(1000))
+        assert abs(total - levels[name]) < 15, name
+    assert envs.spec(f"{SWINGUP}:mujoco").levels == envs.spec(SWINGUP).levels
+    assert not envs.spec(f"{SWINGUP}@spring").levels, "another engine brings other returns"
 
 
 @pytest.mark.parametrize("title", TITLES)

@@ -19,6 +19,7 @@ import numpy as np
 import envs
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
+from dreamer_jax.device_round import on_device
 from dreamer_jax.integrity import DamagedError, write_sealed_json
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.training import Run
@@ -101,6 +102,8 @@ def make_run(
             state, report = transferred_members(spec, sources, workers=workers)
         agent = make_agent(spec)
         env = make_env(spec, workers=workers, timeout=timeout)
+        # What cannot be had is refused before the folder is made.
+        on_device(agent, env.has_host, len(spec.tasks), len(spec.members))
         lock = lock or FolderLock(directory)
         _check_folder(directory, spec, resume)  # again, now that nobody else can change it
         if report is not None:

@@ -19,6 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
+from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
@@ -252,7 +253,8 @@ def estimate(run: PlannedRun, speed: Speed) -> Estimate:
 
 
 def in_memory(spec: RunSpec) -> RunSpec:
-    """The spec with its updates in chunks, where the device's memory is short for all at once."""
+    """The spec with its updates in chunks, where the device's memory is short for all at once (and
+    for the replay, if that lies there too)."""
     device = jax.local_devices()[0]
     limit = (device.memory_stats() or {}).get("bytes_limit")
     if limit is None or _chunk(spec) == 1:
@@ -260,7 +262,11 @@ def in_memory(spec: RunSpec) -> RunSpec:
     alone = dataclasses.replace(spec, seeds=spec.seeds[:1])
     update, *_ = _compiled_update(make_agent(alone))
     update_bytes = max(1, update.memory_analysis().temp_size_in_bytes)
-    fits = int(MEMORY_SHARE * limit - _memory(spec, update_bytes, 0)) // update_bytes
+    taken = _memory(spec, update_bytes, 0)
+    sizes = len(spec.tasks), len(spec.members)
+    if on_device(make_agent(spec), any(x.has_host for x in envs.specs(spec.tasks)), *sizes)[0]:
+        taken += replay_bytes(make_agent(spec), *sizes)
+    fits = int(MEMORY_SHARE * limit - taken) // update_bytes
     if fits >= _chunk(spec):
         return spec
     schedule = dataclasses.replace(

@@ -1,0 +1,122 @@
+"""Replay in the device's memory: the newest records of every stream, within a capacity.
+
+A copy of what the files hold (`dreamer_jax.replay`), for programs that store and sample without the
+host. A phase of T ticks has T + 1 records, and the capacity is a whole number of phases, so that a
+new phase takes the place of the oldest as one block.
+
+Axis letters: P population member, K task, T ticks in a phase, C capacity in records, B batch,
+L sequence length, A action.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dreamer_jax.records import Records
+from dreamer_jax.replay import Replay, record_dtype
+from dreamer_jax.schedule import Schedule
+
+
+def capacity(schedule: Schedule) -> int:
+    """C: records of one stream that have to be held at once, whole phases of them.
+
+    Those of the whole run or, of `replay_keep`, the newest that many.
+    """
+    records = schedule.config.phase_ticks + 1
+    keep, phases = schedule.config.replay_keep, schedule.rounds
+    if keep is not None:
+        phases = min(phases, math.ceil(keep / records))
+    return phases * records
+
+
+def record_bytes(image_size: int, action_size: int) -> int:
+    """Bytes of one record: image, action, reward and two flags."""
+    return record_dtype(image_size, action_size).itemsize
+
+
+def empty(members: int, tasks: int, capacity: int, image_size: int, action_size: int) -> Records:
+    """A replay of zeros on the default device, leaves [P, K, C, ...]."""
+    dtype = record_dtype(image_size, action_size)
+    leaves = {
+        name: jnp.zeros((members, tasks, capacity, *dtype[name].shape), dtype[name].base)
+        for name in dtype.names
+    }
+    return Records(**leaves)
+
+
+def write(held: Records, records: Records, phase: jax.Array) -> Records:
+    """The replay with one more phase, in place of the oldest if it is full.
+
+    Args:
+      held: leaves [P, K, C, ...].
+      records: leaves [P, K, T + 1, ...]; C is a multiple of T + 1.
+      phase: int32 [], how many phases were written before.
+    """
+    size = records.reward.shape[2]
+    start = phase % (held.reward.shape[2] // size) * size
+    return jax.tree.map(
+        lambda old, new: jax.lax.dynamic_update_slice_in_dim(old, new, start, axis=2), held, records
+    )
+
+
+def read(held: Records, tasks: jax.Array, starts: jax.Array, length: int) -> Records:
+    """Sequences of records for every member.
+
+    Args:
+      held: leaves [P, K, C, ...].
+      tasks: int32 [P, B], the stream of each sequence.
+      starts: int32 [P, B], the place in [0, C) of its first record.
+      length: L; a sequence that reaches the end of the memory goes on at its beginning.
+
+    Returns:
+      Leaves [P, B, L, ...].
+    """
+    places = (starts[..., None] + jnp.arange(length)) % held.reward.shape[2]
+    one = jax.vmap(lambda leaf, task, place: leaf[task[:, None], place])
+    return held.map(lambda leaf: one(leaf, tasks, places))
+
+
+def filled(files: Replay, capacity: int, records: int) -> Records:
+    """The newest records that the files hold, phase by phase.
+
+    Args:
+      files: the streams, all of one length.
+      capacity: C.
+      records: of one phase, T + 1.
+
+    Raises:
+      ValueError: the streams do not hold whole phases.
+    """
+    held_records, phases = int(files.lengths[0, 0]), int(files.lengths[0, 0]) // records
+    if (files.lengths != phases * records).any():
+        raise ValueError(
+            f"the streams in {files.directory} hold {files.lengths.tolist()} records, no whole "
+            f"number of phases of {records}: resume with the phase's length with which they were "
+            "collected, or with replay=files"
+        )
+    size, actions = files.dtype["image"].shape[0], files.dtype["action"].shape[0]
+    held = empty(files.members, files.tasks, capacity, size, actions)
+    store = jax.jit(write, donate_argnums=0)
+    oldest = max(0, held_records - (capacity if files.keep is None else files.keep))
+    for phase in range(oldest // records, phases):
+        # What is deleted is never sampled.
+        start = max(phase * records, int(files.deleted.max()))
+        streams = [
+            [files.read(p, k, start, (phase + 1) * records) for k in range(files.tasks)]
+            for p in range(files.members)
+        ]
+        missing = start - phase * records
+        rows = {
+            name: np.stack([[_padded(getattr(stream, name), missing) for stream in row] for row in streams])
+            for name in files.dtype.names
+        }
+        held = store(held, Records(**rows), jnp.int32(phase))
+    return held
+
+
+def _padded(values: np.ndarray, missing: int) -> np.ndarray:
+    return np.pad(values, [(missing, 0)] + [(0, 0)] * (values.ndim - 1))

@@ -1,0 +1,303 @@
+"""Rounds as one program, with the replay on the device, beside the same rounds with files.
+
+P = 2 members, K = 2 tasks, 4 rounds; of each stream's 84 records the newest 25 are sampled, and the
+device has room for two phases of 21.
+"""
+
+import dataclasses
+import signal
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dreamer_jax import device_replay, device_round
+from dreamer_jax.agent import Agent
+from dreamer_jax.config import preset
+from dreamer_jax.device_round import on_device, whole_round
+from dreamer_jax.logs import read_metrics
+from dreamer_jax.records import Records
+from dreamer_jax.replay import Replay
+from dreamer_jax.schedule import Schedule
+from dreamer_jax.training import Member, Run
+from probes import Probe
+
+
+class Inside(Probe):
+    """A probe that says that it needs no host."""
+
+    has_host = False
+
+
+def config_with(**settings):
+    config = preset("debug")
+    settings = {"environment_steps": 320, "replay_keep": 25, "replay": "device"} | settings
+    return dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, **settings))
+
+
+# Shared, so that all runs of these tests share their compiled functions.
+AGENT, ENV = Agent(config_with(), 2), Inside()
+FILES = Agent(config_with(replay="files"), 2)
+MEMBERS = (Member(0, "one"), Member(7, "two"))
+TASKS = ("probe/left", "probe/right")
+
+
+def run_in(directory, agent=AGENT, **options):
+    return Run(agent, ENV, TASKS, MEMBERS, directory, **({"videos": 0} | options))
+
+
+def trained(directory, **options):
+    run = run_in(directory, **options)
+    outcome = run.train()
+    run.close()
+    return run, outcome
+
+
+def metrics(directory):
+    return (directory / "metrics.jsonl").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("device")
+    run, outcome = trained(directory)
+    assert outcome == "finished"
+    return directory, run
+
+
+def assert_same(directory, other, rel):
+    """Both folders' metrics have the same rows, and the same numbers to a relative error."""
+    rows, others = read_metrics(directory), read_metrics(other)
+    assert len(rows) == len(others)
+    for one, two in zip(rows, others, strict=True):
+        assert list(one) == list(two)
+        for name, value in one.items():
+            if isinstance(value, float):
+                value = pytest.approx(value, rel=rel, abs=rel, nan_ok=True)
+            assert two[name] == value, (one["kind"], name)
+
+
+def test_a_round_as_one_program_gives_the_metrics_of_the_path_with_files(finished, tmp_path):
+    directory, run = finished
+    other, outcome = trained(tmp_path, agent=FILES)
+    assert outcome == "finished" and run.device_rounds and not other.device_rounds
+    kinds = {row["kind"] for row in read_metrics(directory)}
+    assert kinds == {"collect", "update", "evaluation"} and run.counters.updates == 16
+    assert_same(directory, tmp_path, rel=1e-3)
+    # What no update has touched is the same to the bit: the round of random actions, all rows of it
+    # and the records of every stream.
+    random = [metrics(folder).splitlines()[:4] for folder in (directory, tmp_path)]
+    assert random[0] == random[1]
+    for stream in np.ndindex(2, 2):
+        held = [x.replay.path(*stream).read_bytes() for x in (run, other)]
+        size = 21 * run.replay.dtype.itemsize
+        assert held[0][:size] == held[1][:size] and len(held[0]) == len(held[1])
+
+
+def test_all_rounds_share_one_program(finished):
+    assert whole_round._cache_size() == 1
+
+
+def stopping_in(monkeypatch, rounds, what):
+    """Does something in the midst of the round of that number."""
+    original, left = device_round.whole_round, [rounds]
+
+    def counting(*arguments, **options):
+        left[0] -= 1
+        result = original(*arguments, **options)
+        if left[0] == 0:
+            what()
+        return result
+
+    monkeypatch.setattr(device_round, "whole_round", counting)
+
+
+@pytest.mark.parametrize("agent", [AGENT, FILES], ids=["device", "files"])
+def test_a_run_stopped_by_ctrl_c_goes_on_with_either_replay(finished, tmp_path, agent, monkeypatch):
+    directory, whole = finished
+    run = run_in(tmp_path)
+    with monkeypatch.context() as patch:
+        stopping_in(patch, 3, lambda: signal.raise_signal(signal.SIGINT))
+        assert run.train() == "stopped"
+    run.close()
+    assert (run.counters.rounds, run.counters.updates) == (3, 12)
+    resumed, outcome = trained(tmp_path, agent=agent, resume=True)
+    assert outcome == "finished"
+    if agent is FILES:
+        assert_same(directory, tmp_path, rel=1e-3)
+        return
+    assert metrics(tmp_path) == metrics(directory)
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+class Killed(BaseException):
+    """Stands for what ends a process without letting it save."""
+
+
+def raising(error):
+    def action():
+        raise error
+
+    return action
+
+
+def test_a_run_killed_between_checkpoints_equals_one_that_was_not(finished, tmp_path, monkeypatch):
+    directory, whole = finished
+    run = run_in(tmp_path)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        stopping_in(patch, 3, raising(Killed()))
+        run.train()
+    run.close()
+    resumed, _ = trained(tmp_path, resume=True)
+    assert metrics(tmp_path) == metrics(directory)
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_round_whose_records_cannot_be_written_ends_at_the_newest_checkpoint(
+    finished, tmp_path, monkeypatch
+):
+    directory, whole = finished
+    run, append = run_in(tmp_path), Replay.append
+    with monkeypatch.context() as patch:
+
+        def full(self, records):
+            if self.lengths[0, 0] == 42:
+                raise OSError("no space left")
+            append(self, records)
+
+        patch.setattr(Replay, "append", full)
+        with pytest.raises(OSError, match="no space left"):
+            run.train()
+    run.close()
+    assert run.counters.updates == run.state.updates[0] == 8
+    resumed, _ = trained(tmp_path, resume=True)
+    assert metrics(tmp_path) == metrics(directory)
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_device_without_room_for_the_round_names_the_ways_out(tmp_path, monkeypatch):
+    error = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
+    stopping_in(monkeypatch, 1, raising(error))
+    run = run_in(tmp_path)
+    with pytest.raises(MemoryError, match="replay's .* MiB.*replay_keep.*mapping=chunks.*files"):
+        run.train()
+    run.close()
+
+
+def test_a_member_that_turns_not_finite_is_frozen_and_the_other_goes_on(finished, tmp_path, capsys):
+    directory, whole = finished
+    run = run_in(tmp_path)
+    poisoned = run.state.params["reward"]["out"]["bias"].at[1].set(jnp.nan)
+    run.state.params["reward"]["out"]["bias"] = poisoned
+    assert run.train() == "finished"
+    run.close()
+    message = " ".join(capsys.readouterr().out.split())
+    assert "member 1 (two, seed 7) met a loss or gradient that is not finite by update 4" in message
+    np.testing.assert_array_equal(run.state.healthy, [True, False])
+    rows, others = ([r for r in read_metrics(d)] for d in (tmp_path, directory))
+    assert [r for r in rows if r["member"] == 0] == [r for r in others if r["member"] == 0]
+    chex.assert_trees_all_equal(*(jax.tree.map(lambda x: x[0], r.state) for r in (run, whole)))
+
+
+def test_the_replay_is_updated_in_place_and_read_without_a_copy(finished):
+    """With room for many more records than a round looks at, the program's memory beside its
+    arguments stays below that of the replay."""
+    _, run = finished
+    held = jax.eval_shape(lambda: device_replay.empty(2, 2, 21 * 200, 32, 2))
+    size = sum(x.size * x.dtype.itemsize for x in held)
+    drawn = jax.ShapeDtypeStruct((4, 2, 2), jnp.int32)
+    scalar = jax.ShapeDtypeStruct((), jnp.int32)
+    program = whole_round.lower(
+        AGENT, ENV, run.state, run.sums, held, run.seeds, scalar, scalar, scalar, (drawn, drawn),
+        ticks=20, length=5, mapping="auto", chunk=1,
+    )  # fmt: skip
+    assert "callback" not in program.as_text()
+    memory = program.compile().memory_analysis()
+    assert memory.alias_size_in_bytes > size
+    assert memory.temp_size_in_bytes < size / 2
+
+
+def test_a_full_replay_forgets_its_oldest_phase_and_reads_across_its_end(tmp_path):
+    files = Replay(tmp_path, members=2, tasks=2, image_size=4, action_size=3)
+    random = np.random.default_rng(0)
+    held = device_replay.empty(2, 2, 3 * 5, 4, 3)
+    for phase in range(5):
+        records = Records(
+            image=random.integers(0, 256, (2, 2, 5, 4, 4, 3), np.uint8),
+            action=random.normal(size=(2, 2, 5, 3)).astype(np.float32),
+            reward=random.normal(size=(2, 2, 5)).astype(np.float32),
+            first=random.random((2, 2, 5)) < 0.5,
+            terminal=random.random((2, 2, 5)) < 0.5,
+        )
+        files.append(records)
+        held = device_replay.write(held, records, jnp.int32(phase))
+    chex.assert_trees_all_equal(held, device_replay.filled(files, 15, 5))
+    # Records 10 to 24 are held, number 15 in the first place.
+    tasks, starts = np.array([[0, 1], [1, 0]]), np.array([[10, 13], [21, 16]])
+    batch = device_replay.read(held, tasks, starts % 15, 4)
+    for p, b in np.ndindex(2, 2):
+        expected = files.read(p, tasks[p, b], starts[p, b], starts[p, b] + 4)
+        for name, values in expected._asdict().items():
+            np.testing.assert_array_equal(getattr(batch, name)[p, b], values)
+
+
+def test_a_replay_of_other_phases_is_refused(tmp_path):
+    files = Replay(tmp_path, members=1, tasks=1, image_size=4, action_size=1)
+    record = np.zeros((1, 1, 7), bool)
+    zeros = np.zeros((1, 1, 7), np.float32)
+    images = np.zeros((1, 1, 7, 4, 4, 3), np.uint8)
+    files.append(Records(images, zeros[..., None], zeros, record, record))
+    with pytest.raises(ValueError, match=r"hold \[\[7\]\] records, no whole number of phases of 5"):
+        device_replay.filled(files, 10, 5)
+
+
+# Which it is
+
+
+def choice(setting, has_host=False):
+    return on_device(Agent(config_with(replay=setting), 2), has_host, 2, 2)
+
+
+def test_an_environment_with_a_host_is_refused_unless_files_are_a_choice():
+    with pytest.raises(ValueError, match="on the host: choose replay=files, or tasks such as brax"):
+        choice("device", True)
+    assert choice("auto", True) == choice("files", True) == (False, "")
+
+
+def test_an_environment_that_does_not_say_is_taken_to_have_a_host(tmp_path):
+    with pytest.raises(ValueError, match="choose replay=files"):
+        Run(AGENT, Probe(), TASKS, MEMBERS, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_cpu_keeps_files_unless_told_otherwise():
+    assert choice("auto") == (False, "")
+    # 168 records of 32 * 32 * 3 pixels, two actions, a reward and two flags.
+    size = 2 * 2 * 42 * (3072 + 8 + 4 + 2) / 2**20
+    assert choice("device") == (
+        True,
+        f"replay on the device: {size:.1f} MiB (members 2, tasks 2, records 42 of 32 x 32 pixels)",
+    )
+
+
+def test_accelerators_hold_a_replay_that_takes_half_of_their_memory_at_most(monkeypatch):
+    size = 2 * 2 * 42 * 3086
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for memory, outcome in ((2 * size, True), (2 * size - 2, False)):
+        monkeypatch.setattr(device_round, "_memory", lambda memory=memory: memory)
+        chosen, note = choice("auto")
+        assert chosen is outcome
+        assert ("in files" in note and "more than half of its" in note) is not outcome
+    monkeypatch.setattr(device_round, "_memory", lambda: size - 1)
+    with pytest.raises(ValueError, match=r"would take 0.5 MiB.*has 0.5 MiB.*replay_keep, less th"):
+        choice("device")
+
+
+def test_the_capacity_is_whole_phases_of_what_is_sampled():
+    def records(**settings):
+        return device_replay.capacity(Schedule(config_with(**settings).schedule, 1))
+
+    assert records(replay_keep=None) == 8 * 21
+    assert [records(replay_keep=keep) for keep in (21, 22, 10**6)] == [21, 42, 8 * 21]
