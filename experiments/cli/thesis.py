@@ -212,6 +212,11 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     return runs, progress
 
 
+def _to_standard_error(done: int, total: int, text: str) -> None:
+    """A `Report` in lines, apart from what the command prints."""
+    print(f"  [{done}/{total}] {text}", file=sys.stderr, flush=True)
+
+
 def _tell_problems(progress) -> int:
     """Names what was not trained.
 
@@ -241,9 +246,7 @@ def plan(command: Plan) -> int:
     speed = None
     if due:
         print("measuring how fast this machine is:", file=sys.stderr)
-        speed = estimate.measure(
-            (run.spec for run in due), lambda what: print(f"  {what}", file=sys.stderr, flush=True)
-        )
+        speed = estimate.measure((run.spec for run in due), _to_standard_error)
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, speed))
     if speed is not None:
@@ -257,8 +260,7 @@ def plan(command: Plan) -> int:
 
 def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     """Trains what is missing and writes tables and figures."""
-    from rich.progress import Progress
-
+    from dreamer_jax.progress import reported
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
@@ -274,17 +276,14 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
             progress.skipped[entry.name] = f"it needs {name}"
             continue
         try:
-            with Progress() as bar:
-                job = bar.add_task("gathering", visible=False)
+            with reported("gathering") as report:
                 make_table(
                     sweep.root,
                     entry,
                     sweep.seeds[0],
                     workers=sweep.workers,
                     accept_failed=sweep.accept_failed,
-                    report=lambda done, rounds, bar=bar, job=job: bar.update(
-                        job, completed=done, total=rounds, visible=True
-                    ),
+                    report=report,
                 )
         except ValueError as error:
             progress.failed[entry.name] = str(error)

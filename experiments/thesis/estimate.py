@@ -9,7 +9,7 @@ Axis letters: P population member, K task, T ticks in a phase, A action.
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -21,6 +21,7 @@ from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.progress import Report, unreported
 from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
@@ -96,7 +97,7 @@ def _compiled_update(agent: Agent):
     return lowered.compile(), state, sums, batch
 
 
-def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what: None) -> Speed:
+def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     """Measures the updates and the simulators of runs of one preset.
 
     A plain agent of the largest action size stands for all of them. Nearly all of the time goes to
@@ -104,14 +105,14 @@ def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what:
 
     Args:
       specs: the runs.
-      tell: is told what is measured next.
+      report: called before each measurement with what it is of; it counts those begun.
     """
     specs = tuple(specs)
     tasks = tuple(dict.fromkeys(task for spec in specs for task in spec.tasks))
     things = len(tasks) + 1
     widest = max(tasks, key=lambda task: envs.spec(task).action_size)
     agent = make_agent(RunSpec((widest,), (0,), specs[0].config))
-    tell(f"[1/{things}] an update and a policy")
+    report(1, things, "an update and a policy")
     started = time.perf_counter()
     update, state, sums, batch = _compiled_update(agent)
     policy_seconds = _policy_seconds(agent, state.params)
@@ -129,7 +130,7 @@ def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what:
     update_seconds = (time.perf_counter() - started) / updates
     ticks = {}
     for number, task in enumerate(tasks, start=2):
-        tell(f"[{number}/{things}] {task}")
+        report(number, things, task)
         ticks[task] = _tick_seconds(task, agent.config)
     return Speed(
         update_seconds=update_seconds,
