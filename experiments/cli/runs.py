@@ -51,11 +51,11 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
-    accept_failed: bool = False
-    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
