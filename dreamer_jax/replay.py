@@ -211,8 +211,8 @@ class Replay:
             for stream in self._streams():
                 path = self.path(*stream)
                 rows = np.empty(steps, self.dtype)
-                for name in self.dtype.names:
-                    rows[name] = getattr(records, name)[stream]
+                for name, values in records._asdict().items():
+                    rows[name] = values[stream]
                 with open(path, "r+b") as file:
                     file.seek(int(self._lengths[stream]) * self.dtype.itemsize)
                     _write(file, rows)

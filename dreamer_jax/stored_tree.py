@@ -198,9 +198,9 @@ def _compare(folder: Path, saved: list[_Leaf], expected: list[_Leaf]) -> None:
     for path in sorted(saved_by_path.keys() | expected_by_path.keys()):
         there, wanted = saved_by_path.get(path), expected_by_path.get(path)
         if there != wanted:
-            name = (there or wanted).name
+            names = {leaf.name for leaf in (there, wanted) if leaf is not None}
             differences.append(
-                f"{name}: saved {there or 'nothing'}, expected {wanted or 'nothing'}"
+                f"{names.pop()}: saved {there or 'nothing'}, expected {wanted or 'nothing'}"
             )
     if differences:
         more = len(differences) - _SHOWN
@@ -234,7 +234,7 @@ def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
 
 
 def _checksum(value: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(value).view(np.uint8)) if value.size else 0
+    return zlib.crc32(np.ascontiguousarray(value).view(np.uint8).data) if value.size else 0
 
 
 def _first_line(error: Exception) -> str:

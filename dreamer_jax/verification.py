@@ -104,7 +104,7 @@ def _replay(directory: Path, committed: list[dict]) -> Iterable[Finding]:
     streams = list(np.ndindex(*lengths.shape))
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         for problem, missing in pool.map(
-            lambda stream: replay.verify(*stream, int(lengths[stream])), streams
+            lambda stream: replay.verify(stream[0], stream[1], int(lengths[stream])), streams
         ):
             problems += [problem] if problem else []
             unchecked += missing
@@ -135,5 +135,4 @@ def _metrics(directory: Path, committed: list[dict]) -> Iterable[Finding]:
                 raise DamagedError(
                     f"{path} is not what was written: its first {offset} bytes differ"
                 )
-    state = "sound" if checked else "unchecked"
-    yield Finding("metrics.jsonl", state, f"{len(rows)} rows")
+    yield Finding("metrics.jsonl", "sound" if checked else "unchecked", f"{len(rows)} rows")

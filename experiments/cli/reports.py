@@ -140,9 +140,10 @@ def _write(
 ) -> None:
     from experiments.reports import page, publication, tidy
     from experiments.reports.outcomes import read_runs
-    from experiments.runs.folder import report_folder
+    from experiments.runs.folder import folders, report_folder
 
-    folder = report_folder(root, backend)
+    folder, held = report_folder(root, backend), folders(root)
+    entries = [grid.with_compared(entry, held, seeds) for entry in entries]
     folder.mkdir(parents=True, exist_ok=True)
     for entry in entries:
         if isinstance(entry, Table):

@@ -51,11 +51,11 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
-    accept_failed: bool = False
-    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
@@ -257,25 +257,22 @@ def evaluate(command: Evaluate) -> int:
 
 def _evaluate(command: Evaluate) -> int:
     import numpy as np
-    from rich.progress import Progress
 
     from dreamer_jax.files import write_json_atomically
+    from dreamer_jax.progress import reported
     from experiments.runs.evaluate import evaluate, load_agents
     from experiments.runs.text import aligned
 
     with usage_errors():
         agents = load_agents(command.directory)
-    with Progress() as bar:
-        job = bar.add_task("evaluating", total=command.episodes)
+    with reported("evaluating") as report:
         rows = evaluate(
             agents,
             command.episodes,
             video=command.video,
             workers=command.workers,
             timeout=command.simulator_timeout,
-            report=lambda done, score: bar.update(
-                job, completed=done, description=f"evaluating, return {score:.0f}"
-            ),
+            report=report,
         )
     groups: dict[tuple, list] = {}
     for row in rows:
@@ -305,8 +302,7 @@ def _evaluate(command: Evaluate) -> int:
 
 def classify(command: Classify) -> int:
     """Tells the tasks of latent states."""
-    from rich.progress import Progress
-
+    from dreamer_jax.progress import reported
     from experiments.runs import classify
     from experiments.runs.agents import load_source
     from experiments.runs.trust import check_trust
@@ -323,9 +319,7 @@ def classify(command: Classify) -> int:
         load = functools.partial(load_source, accept_failed=command.accept_failed)
         source = load(command.source, command.source_member)
         actors = [load(directory) for directory in command.actors]
-        with Progress() as bar:
-            total = classify.rounds(source, command.samples) * max(1, len(actors))
-            job = bar.add_task("gathering samples", total=total)
+        with reported("gathering samples") as report:
             outcome = classify.classify(
                 source,
                 command.task,
@@ -335,7 +329,7 @@ def classify(command: Classify) -> int:
                 actors=actors,
                 seed=command.seed,
                 workers=command.workers,
-                report=lambda: bar.advance(job),
+                report=report,
                 **request,
             )
     folder = command.source / "classification" if command.out is None else command.out

@@ -48,15 +48,13 @@ class Zoo:
 
 def export(command: Export) -> int:
     """Writes an agent and its card."""
-    from rich.progress import Progress
-
+    from dreamer_jax.progress import reported
     from experiments.runs.export import export
     from experiments.runs.trust import check_trust
 
     with usage_errors():
         check_trust([command.directory], command.trust)
-    with usage_errors(), Progress() as bar:
-        job = bar.add_task("playing", total=command.episodes)
+    with usage_errors(), reported("playing") as report:
         card = export(
             command.directory,
             command.out,
@@ -64,9 +62,7 @@ def export(command: Export) -> int:
             episodes=command.episodes,
             note=command.note,
             workers=command.workers,
-            report=lambda done, score: bar.update(
-                job, completed=done, description=f"playing, return {score:.0f}"
-            ),
+            report=report,
         )
     for task in card.spec.tasks:
         print(f"{task}: {card.verdict(task)}")

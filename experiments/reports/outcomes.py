@@ -9,7 +9,6 @@ Axis letters: E evaluations.
 """
 
 import dataclasses
-import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +23,7 @@ from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
 from dreamer_jax.schema import EVALUATION_ROW, check_shape
 from experiments.reports import statistics
-from experiments.runs.folder import folders, run_folders
+from experiments.runs.folder import folders, run_folders, sound
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.thesis.grid import Backend, Cell, Figure, Metric, Table, shown
 
@@ -118,12 +117,9 @@ def _outcome(spec: RunSpec, rows: Iterable[Mapping[str, Any]]) -> Outcome:
     found: dict[int, dict[str, float]] = {}
     failed_at = None
     for row in rows:
-        evaluation = row["kind"] == "evaluation"
-        # Rows of evaluations did not always say whether the member is healthy.
-        sound = row.get("healthy", True) and not (evaluation and not math.isfinite(row["return"]))
-        if not sound and failed_at is None:
+        if not sound(row) and failed_at is None:
             failed_at = row["env_steps"]
-        if evaluation:
+        if row["kind"] == "evaluation":
             found.setdefault(row["env_steps"], {})[row["task"]] = row["return"]
     # A run that was killed may have evaluated some of its tasks only.
     whole = {steps: each for steps, each in sorted(found.items()) if len(each) == len(spec.tasks)}
