@@ -11,7 +11,7 @@ class RecordsError(RuntimeError):
     """An environment or a policy gave what cannot be learned from."""
 
 
-def check_records(records: Records, tasks: Sequence[str]) -> None:
+def check_records(records: Records, tasks: Sequence[str], healthy: np.ndarray) -> None:
     """Checks the records of one phase.
 
     Args:
