@@ -41,11 +41,9 @@ def record_bytes(image_size: int, action_size: int) -> int:
 def empty(members: int, tasks: int, capacity: int, image_size: int, action_size: int) -> Records:
     """A replay of zeros on the default device, leaves [P, K, C, ...]."""
     dtype = record_dtype(image_size, action_size)
-    leaves = {
-        name: jnp.zeros((members, tasks, capacity, *dtype[name].shape), dtype[name].base)
-        for name in dtype.names
-    }
-    return Records(**leaves)
+    layouts = (dtype[name] for name in Records._fields)
+    shape = (members, tasks, capacity)
+    return Records(*(jnp.zeros((*shape, *layout.shape), layout.base) for layout in layouts))
 
 
 def write(held: Records, records: Records, phase: jax.Array) -> Records:
@@ -105,20 +103,17 @@ def filled(files: Replay, capacity: int, records: int) -> Records:
     for phase in range(oldest // records, phases):
         # What is deleted is never sampled.
         start = max(phase * records, int(files.deleted.max()))
-        streams = [
-            [files.read(p, k, start, (phase + 1) * records) for k in range(files.tasks)]
-            for p in range(files.members)
-        ]
         missing = start - phase * records
-        rows = {
-            name: np.stack(
-                [[_padded(getattr(stream, name), missing) for stream in row] for row in streams]
-            )
-            for name in files.dtype.names
-        }
-        held = store(held, Records(**rows), jnp.int32(phase))
+        streams = [
+            _padded(files.read(p, k, start, (phase + 1) * records), missing)
+            for p, k in np.ndindex(files.members, files.tasks)
+        ]
+        rows = jax.tree.map(lambda *x: np.stack(x), *streams)
+        rows = rows.map(lambda x: x.reshape(files.members, files.tasks, *x.shape[1:]))
+        held = store(held, rows, jnp.int32(phase))
     return held
 
 
-def _padded(values: np.ndarray, missing: int) -> np.ndarray:
-    return np.pad(values, [(missing, 0)] + [(0, 0)] * (values.ndim - 1))
+def _padded(records: Records, missing: int) -> Records:
+    """Records with zeros in front."""
+    return records.map(lambda x: np.pad(x, [(missing, 0)] + [(0, 0)] * (x.ndim - 1)))
