@@ -67,7 +67,7 @@ $(VENV)/.weights: $(STAMP)bullet+brax+gymnasium+dev
 	@touch $@
 
 test: $(STAMP)bullet+brax+gymnasium+dev $(VENV)/.weights  ## Run the test suite (15 minutes)
-	$(RUN) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
+	$(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(STAMP)bullet+brax+gymnasium+dev  ## Check style and types
 	$(RUN) -m ruff check .

@@ -50,13 +50,13 @@ class Seeds:
     """Numbers of tables of returns (1 to 12, 16, 17)."""
     preset: Preset = DEFAULT_PRESET
     """Whose results."""
-    group: int = 5
+    group: int = setting(5, 1, 10_000)
     """Seeds between two looks."""
-    most: int = 20
+    most: int = setting(20, 1, 10_000)
     """Seeds at the last look."""
-    omegas: tuple[float, ...] = grid.OMEGAS
+    omegas: tuple[float, ...] = setting(grid.OMEGAS, 0, 1)
     """The fractions that are to be compared; the fewer, the fewer seeds they need."""
-    counts: tuple[int, ...] = grid.COUNTS
+    counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """The numbers of source tasks that are to be compared."""
     backend: Backend = "bullet"
     """The simulators."""

@@ -42,6 +42,8 @@ class Sweep:
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    yes: bool = False
+    """At a terminal: begin without a question, however long it takes."""
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
     file: ConfigFile = None
@@ -82,13 +84,16 @@ class Plan:
     """Show the runs that tables and figures need, and what they will take, without running them.
 
     Time, memory and disk are estimates, from a short measurement on this machine: half a minute
-    for each simulator and one for updates, most of it compilation.
+    for each simulator and one for updates, most of it compilation. It is made once for a machine
+    and its settings, and kept.
     """
 
     table: tuple[str, ...] = ()
     """Numbers of tables (1 to 17), or all."""
     figure: tuple[str, ...] = ()
     """Numbers of figures (10 to 39), or all."""
+    measure: bool = False
+    """Measure this machine anew."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
 
 
@@ -212,11 +217,6 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     return runs, progress
 
 
-def _to_standard_error(done: int, total: int, text: str) -> None:
-    """A `Report` in lines, apart from what the command prints."""
-    print(f"  [{done}/{total}] {text}", file=sys.stderr, flush=True)
-
-
 def _tell_problems(progress) -> int:
     """Names what was not trained.
 
@@ -242,20 +242,68 @@ def plan(command: Plan) -> int:
             *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
         ]
     runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
-    due = [run for run in runs if run.state in ("missing", "cut")]
-    speed = None
-    if due:
-        print("measuring how fast this machine is:", file=sys.stderr)
-        speed = estimate.measure((run.spec for run in due), _to_standard_error)
+    known = _speed(runs, again=command.measure)
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
-    print(estimate.plan_table(runs, speed))
-    if speed is not None:
+    print(estimate.plan_table(runs, known and known.speed))
+    if known is not None:
+        ticks = 1000 * max(known.speed.tick_seconds.values())
+        when = f"kept in {known.path} (--measure measures anew)" if known.kept else "here and now"
         print(
-            f"\nAn estimate, from {speed.update_seconds:.3g} s for an update of one agent and "
-            f"{1000 * max(speed.tick_seconds.values()):.1f} ms for a tick of\nthe slowest "
-            "simulator here and now. Runs come one after another; each is compiled first."
+            f"\nAn estimate, from {known.speed.update_seconds:.3g} s for an update of one agent "
+            f"and {ticks:.1f} ms for a tick of the\nslowest simulator, measured {when}.\n"
+            "Runs come one after another; each is compiled first."
         )
     return 0
+
+
+LONG_SECONDS = 3600.0
+"""What takes longer is begun at a terminal only after a question."""
+
+
+def _speed(runs, again: bool = False):
+    """How fast this machine is at the runs that are due; None if none is."""
+    from experiments.thesis.estimate import DUE
+    from experiments.thesis.speeds import cache_folder, speed_of
+
+    due = [run.spec for run in runs if run.state in DUE]
+    if not due:
+        return None
+
+    def report(number: int, count: int, what: str) -> None:
+        if number == 1:
+            print("measuring how fast this machine is:", file=sys.stderr)
+        print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
+
+    return speed_of(due, cache_folder(), again=again, report=report)
+
+
+def _may_begin(runs) -> bool:
+    """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
+    from dreamer_jax.schedule import Schedule
+    from experiments.thesis import estimate
+
+    due = [run for run in runs if run.state in estimate.DUE]
+    updates = sum(
+        Schedule(run.spec.config.schedule, len(run.spec.tasks)).updates * len(run.spec.members)
+        for run in due
+    )
+    # An update that takes a second is one of the largest sizes on a machine without accelerator.
+    if updates < LONG_SECONDS:
+        return True
+    speed = _speed(runs).speed
+    total = estimate.together(runs, speed)
+    if total.seconds < LONG_SECONDS:
+        return True
+    agents = sum(len(run.cells) for run in due)
+    print(
+        f"{len(due)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
+        "They can be stopped with\nCtrl-C and go on with the same command; plan shows them one by "
+        "one, --yes begins without asking."
+    )
+    try:
+        return input("Begin? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
 
 
 def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
@@ -264,6 +312,9 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
+    if not sweep.yes and sys.stdin.isatty() and not _may_begin(_planned(entries, sweep)):
+        print("nothing was begun")
+        return STOPPED
     runs, progress = _carry_out(entries, sweep)
     if progress.stopped:
         return STOPPED
