@@ -103,20 +103,21 @@ def filled(files: Replay, capacity: int, records: int) -> Records:
     store = jax.jit(write, donate_argnums=0)
     oldest = max(0, held_records - (capacity if files.keep is None else files.keep))
     for phase in range(oldest // records, phases):
-        # What is deleted is never sampled.
-        start = max(phase * records, int(files.deleted.max()))
-        streams = [
-            [files.read(p, k, start, (phase + 1) * records) for k in range(files.tasks)]
-            for p in range(files.members)
-        ]
-        missing = start - phase * records
-        rows = {
-            name: np.stack([[_padded(getattr(stream, name), missing) for stream in row] for row in streams])
-            for name in files.dtype.names
-        }
-        held = store(held, Records(**rows), jnp.int32(phase))
+        held = store(held, _phase(files, phase, records), jnp.int32(phase))
     return held
 
 
-def _padded(values: np.ndarray, missing: int) -> np.ndarray:
-    return np.pad(values, [(missing, 0)] + [(0, 0)] * (values.ndim - 1))
+def _phase(files: Replay, phase: int, records: int) -> Records:
+    """One phase of all streams, [P, K, T + 1, ...]; zeros for what is deleted (never sampled)."""
+    start = max(phase * records, int(files.deleted.max()))
+    missing = start - phase * records
+
+    def of_all_streams(*leaves: np.ndarray) -> np.ndarray:
+        rows = np.pad(np.stack(leaves), [(0, 0), (missing, 0)] + [(0, 0)] * (leaves[0].ndim - 1))
+        return rows.reshape(files.members, files.tasks, *rows.shape[1:])
+
+    streams = [
+        files.read(p, k, start, (phase + 1) * records)
+        for p, k in np.ndindex(files.members, files.tasks)
+    ]
+    return jax.tree.map(of_all_streams, *streams)

@@ -239,8 +239,7 @@ def test_a_full_replay_forgets_its_oldest_phase_and_reads_across_its_end(tmp_pat
     batch = device_replay.read(held, tasks, starts % 15, 4)
     for p, b in np.ndindex(2, 2):
         expected = files.read(p, tasks[p, b], starts[p, b], starts[p, b] + 4)
-        for name, values in expected._asdict().items():
-            np.testing.assert_array_equal(getattr(batch, name)[p, b], values)
+        chex.assert_trees_all_equal(batch.at(p, b), expected)
 
 
 def test_a_replay_of_other_phases_is_refused(tmp_path):
