@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: a page for each module of the packages, made of its docstrings."""
+"""Hooks of mkdocs: pages of modules, made of their docstrings, and pages that nothing names."""
 
 from pathlib import Path
 
@@ -19,11 +19,20 @@ def modules(package):
             yield ".".join(parts)
 
 
+def named(nav):
+    """All pages that a navigation names."""
+    for entry in nav.values() if isinstance(nav, dict) else nav:
+        yield from [entry] if isinstance(entry, str) else named(entry)
+
+
 def on_config(config):
-    pages = [
+    pages = [path.name for path in sorted((ROOT / "docs").glob("*.md"))]
+    if others := [name for name in pages if name not in set(named(config.nav))]:
+        config.nav.append({"More": others})
+    reference = [
         {package: [f"reference/{name}.md" for name in modules(package)]} for package in PACKAGES
     ]
-    config.nav.append({"Reference": pages})
+    config.nav.append({"Reference": reference})
     return config
 
 

@@ -100,7 +100,9 @@ class Agent(Model):
         if isinstance(mode, str):
             if mode not in MODES:
                 raise ValueError(f"unknown policy mode {mode!r}: choose one of {', '.join(MODES)}")
-            mode = MODES.index(mode)
+            chosen: int | jax.Array = MODES.index(mode)
+        else:
+            chosen = mode
 
         def at_random() -> tuple[jax.Array, Carry]:
             action = self._held(self.random_action(key), carry.random, first, key)
@@ -108,13 +110,12 @@ class Agent(Model):
 
         def by_actor() -> tuple[jax.Array, Carry]:
             latent_key, action_key, explore_key = jax.random.split(key, 3)
-            variables = {"params": params["dynamics"]}
+            dynamics, variables = self.dynamics, params["dynamics"]
             embedded = self.encode(params, image[None])[0]
-            projected = self.dynamics.apply(variables, embedded, method="project")
+            projected = networks.applied(dynamics, variables, embedded, method="project")
             noise = jax.random.normal(latent_key, carry.state.stochastic.shape)
-            state = self.dynamics.apply(
-                variables, carry.state, carry.action, projected, first, noise, method="obs_step"
-            )
+            inputs = (carry.state, carry.action, projected, first, noise)
+            state = networks.applied(dynamics, variables, *inputs, method="obs_step")
             outputs = self.head(params, "actor", state.features)
 
             def evaluated() -> tuple[jax.Array, jax.Array]:
@@ -124,10 +125,10 @@ class Agent(Model):
                 action = self.sample(outputs, self.action_noise(action_key, ()))
                 return self._explore(action, carry.random, first, explore_key, updates)
 
-            action, random = _one_of(mode == MODES.index("evaluate"), evaluated, explored)
+            action, random = _one_of(chosen == MODES.index("evaluate"), evaluated, explored)
             return action, Carry(state, action, random)
 
-        return _one_of(mode == MODES.index("random"), at_random, by_actor)
+        return _one_of(chosen == MODES.index("random"), at_random, by_actor)
 
     def _mode(self, outputs: jax.Array, key: jax.Array) -> jax.Array:
         if self.discrete:

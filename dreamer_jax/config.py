@@ -254,7 +254,7 @@ def _presets() -> dict[str, Config]:
     # What 32 x 32 pixels need to be learned from on two cores, by measurement (docs/learning.md):
     # pictures that outweigh the divergence, a faster model, an actor that is kept from settling
     # before there is one, and exploration that shows the model something.
-    learns = {
+    learns: dict[str, Any] = {
         "free_nats": 0.0,
         "kl_scale": 0.03,
         "model_learning_rate": 3e-3,
@@ -327,7 +327,9 @@ def from_dict(values: dict) -> Config:
     Raises:
       ValueError: a group or setting is unknown; one that is missing takes its default.
     """
-    groups = {entry.name: entry.default_factory for entry in dataclasses.fields(Config)}
+    groups: dict[str, Any] = {
+        entry.name: entry.default_factory for entry in dataclasses.fields(Config)
+    }
     unknown = set(values) - set(groups)
     _require(not unknown, f"unknown settings {sorted(unknown)}: the groups are {list(groups)}")
     built = {}

@@ -11,7 +11,7 @@ kernel, C the input channels, O the output channels, and "..." any number of bat
 
 import functools
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -315,7 +315,8 @@ def _over_windows(large, k, kernel=None, small=None):
             total += _product(windows, _rows(lax.dynamic_index_in_dim(small, row, 1, False), 1).T)
         return total, None if kernel is None else _product(matrix, windows)
 
-    total, contracted = lax.scan(add_row, None if small is None else total, jnp.arange(rows))
+    start = None if small is None else total
+    total, contracted = lax.scan(add_row, start, jnp.arange(rows))  # type: ignore[arg-type]
     if small is not None:
         total = total.reshape(k, channels, k, small.shape[0]).transpose(2, 0, 1, 3)
     if kernel is not None:
@@ -360,11 +361,11 @@ def _overlap_add(windows, height, width):
 
     The adjoint of `_windows`. In each direction a pixel lies in at most ceil(k / 2) windows.
     """
-    k, windows_down, windows_across = windows.shape[0], *windows.shape[3:5]
+    k, (windows_down, windows_across) = windows.shape[0], windows.shape[3:5]
     windows = windows.transpose(2, 0, 1, 3, 4, 5)
     if (windows_down, windows_across, height, width) == (1, 1, k, k):
         return windows[:, :, :, 0, 0]
-    total = 0
+    total: Any = 0
     for first_row in range(0, k, 2):
         row, down, in_row = _covering(first_row, k, windows_down, height)
         for first_column in range(0, k, 2):

@@ -41,11 +41,9 @@ def record_bytes(image_size: int, action_size: int) -> int:
 def empty(members: int, tasks: int, capacity: int, image_size: int, action_size: int) -> Records:
     """A replay of zeros on the default device, leaves [P, K, C, ...]."""
     dtype = record_dtype(image_size, action_size)
-    leaves = {
-        name: jnp.zeros((members, tasks, capacity, *dtype[name].shape), dtype[name].base)
-        for name in dtype.names
-    }
-    return Records(**leaves)
+    layouts = (dtype[name] for name in Records._fields)
+    shape = (members, tasks, capacity)
+    return Records(*(jnp.zeros((*shape, *layout.shape), layout.base) for layout in layouts))
 
 
 def write(held: Records, records: Records, phase: jax.Array) -> Records:
@@ -103,21 +101,19 @@ def filled(files: Replay, capacity: int, records: int) -> Records:
     store = jax.jit(write, donate_argnums=0)
     oldest = max(0, held_records - (capacity if files.keep is None else files.keep))
     for phase in range(oldest // records, phases):
-        held = store(held, _phase(files, phase, records), jnp.int32(phase))
+        # What is deleted is never sampled.
+        start = max(phase * records, int(files.deleted.max()))
+        missing = start - phase * records
+        streams = [
+            _padded(files.read(p, k, start, (phase + 1) * records), missing)
+            for p, k in np.ndindex(files.members, files.tasks)
+        ]
+        rows = jax.tree.map(lambda *x: np.stack(x), *streams)
+        rows = rows.map(lambda x: x.reshape(files.members, files.tasks, *x.shape[1:]))
+        held = store(held, rows, jnp.int32(phase))
     return held
 
 
-def _phase(files: Replay, phase: int, records: int) -> Records:
-    """One phase of all streams, [P, K, T + 1, ...]; zeros for what is deleted (never sampled)."""
-    start = max(phase * records, int(files.deleted.max()))
-    missing = start - phase * records
-
-    def of_all_streams(*leaves: np.ndarray) -> np.ndarray:
-        rows = np.pad(np.stack(leaves), [(0, 0), (missing, 0)] + [(0, 0)] * (leaves[0].ndim - 1))
-        return rows.reshape(files.members, files.tasks, *rows.shape[1:])
-
-    streams = [
-        files.read(p, k, start, (phase + 1) * records)
-        for p, k in np.ndindex(files.members, files.tasks)
-    ]
-    return jax.tree.map(of_all_streams, *streams)
+def _padded(records: Records, missing: int) -> Records:
+    """Records with zeros in front."""
+    return records.map(lambda x: np.pad(x, [(missing, 0)] + [(0, 0)] * (x.ndim - 1)))

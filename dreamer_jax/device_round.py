@@ -14,7 +14,6 @@ L sequence length, C capacity in records.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -186,7 +185,7 @@ class DeviceRounds:
       seeds: int32 [P].
     """
 
-    def __init__(self, agent: Agent, env, files: Replay, seeds: Sequence[int]):
+    def __init__(self, agent: Agent, env, files: Replay, seeds: jax.Array):
         self._agent, self._env, self._files = agent, env, files
         self._seeds = np.asarray(seeds, np.int32)
         self._schedule = Schedule(agent.config.schedule, files.tasks)

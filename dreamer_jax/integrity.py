@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -28,9 +29,9 @@ class DamagedError(ValueError):
 
 def file_checksum(path: str | os.PathLike, size: int | None = None) -> int:
     """CRC-32 of a file, or of its first `size` bytes, read piece by piece."""
-    checksum, left = 0, float("inf") if size is None else size
+    checksum, left = 0, sys.maxsize if size is None else size
     with open(path, "rb", buffering=0) as file:
-        while left > 0 and (piece := file.read(min(_PIECE, left) if size is not None else _PIECE)):
+        while left > 0 and (piece := file.read(min(_PIECE, left))):
             checksum = zlib.crc32(piece, checksum)
             left -= len(piece)
     return checksum

@@ -12,10 +12,10 @@ Parameters are one dict whose names read like the thesis:
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
 
 from dreamer_jax import networks, randomness, rssm
 from dreamer_jax.config import Config
@@ -39,7 +39,7 @@ class Model:
     config: Config
     action_size: int
     discrete: bool = False
-    modules: tuple[tuple[str, nn.Module], ...] = ()
+    modules: tuple[tuple[str, Any], ...] = ()
 
     @functools.cached_property
     def dtype(self):
@@ -109,7 +109,7 @@ class Model:
 
     def head(self, params: Params, name: str, features: jax.Array) -> jax.Array:
         """The outputs of one head: float [..., M] -> float32 [..., outputs]."""
-        return self.heads[name].apply({"params": params[name]}, features)
+        return networks.applied(self.heads[name], params[name], features)
 
     def reward(self, params: Params, features: jax.Array) -> jax.Array:
         """Predicted reward of a latent state: [..., M] -> float32 [...]."""
@@ -121,14 +121,15 @@ class Model:
 
     def encode(self, params: Params, image: jax.Array) -> jax.Array:
         """Embeddings: uint8 [..., size, size, 3] -> [..., E]."""
-        image = normalise_image(image)
-        return self.encoder.apply({"params": params["encoder"]}, image)
+        return networks.applied(self.encoder, params["encoder"], normalise_image(image))
 
     def decode(self, params: Params, features: jax.Array) -> jax.Array:
         """Reconstructed images, float32 about [-0.5, 0.5]: [..., M] -> [..., size, size, 3]."""
-        return self.decoder.apply({"params": params["decoder"]}, features)
+        return networks.applied(self.decoder, params["decoder"], features)
 
-    def observe(self, params: Params, batch: Records, key: jax.Array):
+    def observe(
+        self, params: Params, batch: Records, key: jax.Array
+    ) -> tuple[rssm.LatentState, jax.Array, jax.Array]:
         """Posterior states [B, L, ...] of a batch, and the prior's mean and std beside them."""
         embeddings = self.encode(params, batch.image)
         return rssm.observe(

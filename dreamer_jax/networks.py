@@ -9,6 +9,7 @@ module's dtype.
 """
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -235,6 +236,12 @@ def one_hot_sample(logits: jax.Array, noise: jax.Array) -> jax.Array:
     probabilities = jax.nn.softmax(logits)
     # The difference is exactly zero in value, so the sample stays exactly one-hot.
     return sample + (probabilities - jax.lax.stop_gradient(probabilities))
+
+
+def applied(module: nn.Module, params: Any, *inputs: Any, method: str | None = None) -> Any:
+    """What a module makes of its inputs with given parameters, by a method of it other than its
+    call if one is named."""
+    return module.apply({"params": params}, *inputs, method=method)
 
 
 def parameter_count(params) -> int:

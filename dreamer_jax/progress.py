@@ -1,13 +1,21 @@
-"""The progress bar of a run: live on a terminal, a plain line now and then elsewhere."""
+"""How far work has come: what tells it, and the bars that show it.
+
+A function that takes long takes `report`, a `Report`, and calls it. `reported` makes one that draws
+a bar; `Progress` is the richer one of a run, live on a terminal, a plain line now and then
+elsewhere.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 import time
 from collections import deque
-from typing import TextIO
+from collections.abc import Callable, Iterator
+from typing import Any, TextIO, cast
 
+import rich.progress
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -15,6 +23,28 @@ from rich.table import Table
 from rich.text import Text
 
 from dreamer_jax.output import SafeStream
+
+Report = Callable[[int, int, str], Any]
+"""Called as `report(done, total, text)` whenever something is done: how much is, of how much, and a
+few words on the newest, or none."""
+
+
+def unreported(done: int, total: int, text: str) -> None:
+    """A `Report` that tells nobody."""
+
+
+@contextlib.contextmanager
+def reported(description: str) -> Iterator[Report]:
+    """A `Report` that draws a bar on standard output, from its first call on."""
+    with rich.progress.Progress() as bar:
+        job = bar.add_task(description, total=None, visible=False)
+
+        def report(done: int, total: int, text: str) -> None:
+            title = f"{description}, {text}" if text else description
+            bar.update(job, completed=done, total=total, description=title, visible=True)
+
+        yield report
+
 
 _WINDOW = 1000  # calls of `update` that the estimated time goes by
 
@@ -54,7 +84,7 @@ class Progress:
         self._phase = ""
         self._last_return: float | None = None
         self._interval = interval
-        self._console = Console(file=SafeStream(stream or sys.stdout))
+        self._console = Console(file=cast(TextIO, SafeStream(stream or sys.stdout)))
         self._live: Live | None = None
         self._printed = -math.inf
         self._history = deque([(time.monotonic(), self._share())], maxlen=_WINDOW)

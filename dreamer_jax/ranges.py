@@ -29,6 +29,7 @@ class Range:
     def __contains__(self, value: Any) -> bool:
         if isinstance(value, bool) or not isinstance(value, numbers.Real) or math.isnan(value):
             return False
+        value = float(value)
         return (value > self.low if self.above else value >= self.low) and value <= self.high
 
     def __str__(self) -> str:
@@ -39,7 +40,7 @@ class Range:
         """What is wrong with a value, in words."""
         if self.why:
             return self.why
-        if isinstance(value, numbers.Real) and value > self.high:
+        if isinstance(value, numbers.Real) and float(value) > self.high:
             return "is too large"
         if self.low == 0 and not self.above:
             return "must not be negative"

@@ -4,16 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dreamer_jax.records import Records
+
 
 class RecordsError(RuntimeError):
     """An environment or a policy gave what cannot be learned from."""
 
 
-def check_records(records, tasks: Sequence[str]) -> None:
+def check_records(records: Records, tasks: Sequence[str]) -> None:
     """Checks the records of one phase.
 
     Args:
-      records: NumPy leaves [P, K, T + 1, ...], named as in `dreamer_jax.rollout.Records`.
+      records: NumPy leaves [P, K, T + 1, ...].
       tasks: names of the K tasks.
 
     Raises:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from dreamer_jax.networks import Dense, Dtype, add_bias, elu, glorot_uniform
+from dreamer_jax.networks import Dense, Dtype, add_bias, applied, elu, glorot_uniform
 
 
 class LatentState(NamedTuple):
@@ -230,9 +230,10 @@ class Dynamics(nn.Module):
     def __call__(self, embedding: jax.Array, action: jax.Array) -> LatentState:
         """One step of everything from the initial state; its use is to create parameters."""
         state = self.initial(embedding.shape[:-1])
-        self.img_step(state, action, 0.0)
+        noise = jnp.zeros_like(state.mean)
+        self.img_step(state, action, noise)
         first = jnp.zeros(embedding.shape[:-1], bool)
-        return self.obs_step(state, action, self.project(embedding), first, 0.0)
+        return self.obs_step(state, action, self.project(embedding), first, noise)
 
     @nn.nowrap
     def initial(self, shape: tuple[int, ...] = ()) -> LatentState:
@@ -266,19 +267,19 @@ def observe(
     """
     batch, length = first.shape
     noise = jax.random.normal(key, (length, batch, dynamics.stochastic_size))
-    variables = {"params": params}
-    projected = dynamics.apply(variables, embeddings, method="project")
+    projected = applied(dynamics, params, embeddings, method="project")
     inputs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (actions, projected, first))
 
     def step(state, inputs):
         action, projected, first, noise = inputs
-        state = dynamics.apply(variables, state, action, projected, first, noise, method="obs_step")
+        inputs = (state, action, projected, first, noise)
+        state = applied(dynamics, params, *inputs, method="obs_step")
         return state, state
 
     _, states = jax.lax.scan(step, dynamics.initial((batch,)), (*inputs, noise))
     states = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), states)
     # The prior needs no sample of its own in the recurrence, so one product serves all steps.
-    mean, std = dynamics.apply(variables, states.deterministic, method="prior_statistics")
+    mean, std = applied(dynamics, params, states.deterministic, method="prior_statistics")
     return states, mean, std
 
 
@@ -306,12 +307,11 @@ def imagine(
       States with leaves [H, ..., sizes].
     """
     noise = jax.random.normal(key, (horizon, *start.stochastic.shape))
-    variables = {"params": params}
 
     def step(state, noises):
         noise, policy_noise = noises
         action = policy(state.features, policy_noise)
-        state = dynamics.apply(variables, state, action, noise, method="img_step")
+        state = applied(dynamics, params, state, action, noise, method="img_step")
         return state, state
 
     _, states = jax.lax.scan(step, start, (noise, policy_noise))

@@ -45,17 +45,17 @@ def sample_indices(
         raise ValueError(f"batch and length must be at least 1, got {batch} and {length}")
     if seed < 0 or update < 0:
         raise ValueError(f"seed and update must not be negative, got {seed} and {update}")
-    lengths = np.asarray(lengths, np.int64)
-    oldest = np.zeros_like(lengths) if deleted is None else np.asarray(deleted, np.int64)
+    held = np.asarray(lengths, np.int64)
+    oldest = np.zeros_like(held) if deleted is None else np.asarray(deleted, np.int64)
     if keep is not None:
-        oldest = np.maximum(oldest, lengths - keep)
-    starts = lengths - oldest - length + 1
+        oldest = np.maximum(oldest, held - keep)
+    starts = held - oldest - length + 1
     eligible = np.flatnonzero(starts > 0)
     if not eligible.size:
         within = "" if keep is None else f" (of which the newest {keep} are sampled)"
         raise ValueError(
             f"no stream is long enough for sequences of {length} records: "
-            f"the streams hold {lengths.tolist()}{within}; collect more or shorten the sequences"
+            f"the streams hold {held.tolist()}{within}; collect more or shorten the sequences"
         )
     random = batch_generator(seed, update)
     tasks = eligible[random.integers(eligible.size, size=batch)]

@@ -22,6 +22,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from dreamer_jax.files import read_json, write_json_atomically
+from dreamer_jax.integrity import DamagedError
+from dreamer_jax.schema import LEAVES, check_shape
 
 Tree = TypeVar("Tree")
 _FORMAT = 1
@@ -176,11 +178,15 @@ def _read_values(
 
 def _read_table(folder: Path) -> list[dict[str, Any]]:
     table = read_part(folder, "leaves.json")
-    if table.get("format") != _FORMAT:
+    if isinstance(table, dict) and table.get("format", _FORMAT) != _FORMAT:
         raise ValueError(
             f"{folder} has format {table.get('format')}, this version reads {_FORMAT}; "
             "use the version that wrote it"
         )
+    try:
+        check_shape(table, LEAVES, folder / "leaves.json")
+    except DamagedError as error:
+        raise CorruptCheckpointError(str(error)) from error
     shapes = ("path", "shape", "stored_shape")
     return [row | {name: tuple(row[name]) for name in shapes} for row in table["leaves"]]
 
@@ -192,9 +198,9 @@ def _compare(folder: Path, saved: list[_Leaf], expected: list[_Leaf]) -> None:
     for path in sorted(saved_by_path.keys() | expected_by_path.keys()):
         there, wanted = saved_by_path.get(path), expected_by_path.get(path)
         if there != wanted:
-            name = (there or wanted).name
+            names = {leaf.name for leaf in (there, wanted) if leaf is not None}
             differences.append(
-                f"{name}: saved {there or 'nothing'}, expected {wanted or 'nothing'}"
+                f"{names.pop()}: saved {there or 'nothing'}, expected {wanted or 'nothing'}"
             )
     if differences:
         more = len(differences) - _SHOWN
@@ -228,7 +234,7 @@ def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
 
 
 def _checksum(value: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(value).view(np.uint8)) if value.size else 0
+    return zlib.crc32(np.ascontiguousarray(value).view(np.uint8).data) if value.size else 0
 
 
 def _first_line(error: Exception) -> str:

@@ -8,10 +8,11 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 """
 
 import dataclasses
+import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -64,13 +65,13 @@ class StopRequest:
     A context manager; outside the main thread it does nothing, as Python allows no more.
 
     Args:
-      notify: is told of the request in words.
+      say: is told of the request in words.
       hurry: called at the request, so that nothing that hangs is waited for.
     """
 
-    def __init__(self, notify: Callable[[str], None], hurry: Callable[[], None]):
+    def __init__(self, say: Callable[[str], None], hurry: Callable[[], None]):
         self.requested = False
-        self._notify, self._hurry = notify, hurry
+        self._say, self._hurry = say, hurry
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -89,7 +90,17 @@ class StopRequest:
             raise KeyboardInterrupt
         self.requested = True
         self._hurry()
-        self._notify("stopping: saving first (once more to quit without)")
+        self._say("stopping: saving first (once more to quit without)")
+
+
+def _mean(values: Sequence[float]) -> float:
+    """The mean, NaN of nothing."""
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def _known_mean(scores: Sequence[float]) -> float:
+    """The mean of the scores that are numbers."""
+    return _mean([score for score in scores if not math.isnan(score)])
 
 
 class Run:
@@ -98,7 +109,9 @@ class Run:
     Args:
       agent: the agent's functions; `agent.config` holds the schedule too.
       env: an environment of P * K slots (see `dreamer_jax.rollout`), with methods `check()`, which
-        raises what its simulators met, and perhaps `hurry()`, after which it waits for none long.
+        raises what its simulators met; perhaps `hurry()`, after which it waits for none long; and
+        perhaps `rest(slots)`, which is told before each phase, by a mask bool [P * K], what need
+        not be simulated: the slots of frozen members.
       tasks: the names of the K tasks.
       members: the P members.
       directory: metrics, checkpoints, replay and videos go here.
@@ -191,15 +204,15 @@ class Run:
         learning = agent.config.learning
         self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
         self._restore(from_checkpoint)
-        self._healthy = np.asarray(self.state.healthy)
         self._warned: set[tuple[int, str]] = set()
 
     def _restore(self, step: int | None = None) -> None:
-        """Goes back to a checkpoint, by default the newest; stays as it is if there is none."""
+        """Goes back to a checkpoint, by default the newest, if there is one."""
         found = self.folder.restore({"agent": self.state, "sums": self.sums}, step)
         if found is not None:
             self.state, self.sums = found[0]["agent"], found[0]["sums"]
             self.counters = Counters(**found[1])
+        self._healthy = np.array(self.state.healthy)
 
     def save(self) -> None:
         """Writes a checkpoint of everything that a resumed run needs."""
@@ -252,7 +265,7 @@ class Run:
                     self.save()
                     if not stop.requested:
                         raise
-                    self._bar.message(f"this phase is given up: {error}")
+                    self._bar.message(f"this phase is given up: {error}")  # type: ignore[unreachable]
                     return "stopped"
             self.save()
         return "finished" if action == "done" else "stopped"
@@ -282,10 +295,14 @@ class Run:
             **chosen.tags,
             "env_steps": self.schedule.environment_steps(rounds),
             "updates": self.counters.updates,
+            "healthy": bool(self._healthy[member]),
         }
 
     def _phase(self, mode: Mode, phase: int) -> Records:
         started = time.perf_counter()
+        if hasattr(self.env, "rest"):
+            # A frozen member learns nothing from what it would play.
+            self.env.rest(np.repeat(~self._healthy, len(self.tasks)))
         records = collect(
             self.agent,
             self.env,
@@ -337,21 +354,21 @@ class Run:
         self.replay.append(records)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            found = episodes(records.at(member, task))
-            scores.append(np.mean([episode.score for episode in found]))
+            found = episodes(records.at(member, task)) if self._healthy[member] else []
+            scores.append(_mean([episode.score for episode in found]))
             row = {
                 "kind": "collect",
                 **self._columns(member, rounds + 1),
                 "task": self.tasks[task],
                 "policy": mode,
                 "episodes": len(found),
-                "return": float(scores[-1]),
-                "length": float(np.mean([episode.length for episode in found])),
+                "return": scores[-1],
+                "length": _mean([episode.length for episode in found]),
             }
             self.writer.write(row)
         self._advance(rounds=rounds + 1)
         self._bar.update(
-            env_steps=self.schedule.environment_steps(rounds + 1), last_return=np.mean(scores)
+            env_steps=self.schedule.environment_steps(rounds + 1), last_return=_known_mean(scores)
         )
 
     def _update(self, stop: StopRequest) -> None:
@@ -359,9 +376,10 @@ class Run:
         self._bar.update(phase="updating")
         learning, schedule = self.agent.config.learning, self.schedule.config
         due = self.schedule.updates_due(self.counters.rounds)
-        started, before, loss = time.perf_counter(), self.counters.updates, None
+        started, before = time.perf_counter(), self.counters.updates
+        loss: jax.Array | None = None
         with self.replay.batches(
-            np.asarray(self.seeds),
+            np.asarray(self.seeds).tolist(),
             range(before, due),
             learning.batch_size,
             learning.sequence_length,
@@ -377,41 +395,35 @@ class Run:
                     chunk=schedule.mapping_chunk,
                 )
                 # One update ahead of the device, no more: the next batch is being prepared.
-                if previous is not None:
-                    previous.block_until_ready()
+                jax.block_until_ready(previous)
                 self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
                 self._bar.update(updates=update + 1)
                 if stop.requested:
                     break
-        loss.block_until_ready()
+        jax.block_until_ready(loss)
         self._time("update", started, updates=self.counters.updates - before)
         if self.counters.updates == due:
             self._write_averages()
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
-        healthy = np.asarray(self.state.healthy)
+        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy)).tolist()
+        self._healthy = np.array(self.state.healthy)
         for member in range(len(self.members)):
             averages = {name: float(x[member]) / count for name, x in sums.items()}
-            row = {
-                "kind": "update",
-                **self._columns(member, self.counters.rounds),
-                "healthy": bool(healthy[member]),
-                **averages,
-            }
+            row = {"kind": "update", **self._columns(member, self.counters.rounds), **averages}
             self.writer.write(row)
             self._warn(member, averages)
-        for member in np.flatnonzero(self._healthy & ~healthy):
+        for member in newly_frozen:
             chosen = self.members[member]
             self._bar.message(
                 f"member {member} ({chosen.label}, seed {chosen.seed}) met a loss or gradient that "
                 f"is not finite by update {self.counters.updates}: it is frozen as it was before, "
                 "the others go on"
             )
-        self._healthy = healthy
         self.sums = jax.tree.map(jnp.zeros_like, self.sums)
         self.counters = dataclasses.replace(self.counters, averaged=0)
-        if not healthy.any():
+        if not self._healthy.any():
             self.save()
             raise NonFiniteError(
                 f"no member of {self.directory} has finite losses any more; lower the learning "
@@ -439,16 +451,17 @@ class Run:
         diagnosis = jax.device_get(found)
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            episode = episodes(records.at(member, task))[0]
-            scores.append(episode.score)
+            healthy, episode = bool(self._healthy[member]), episodes(records.at(member, task))[0]
+            knowledge = {name: float(x[member, task]) for name, x in diagnosis.items()}
+            scores.append(episode.score if healthy else math.nan)
             row = {
                 "kind": "evaluation",
                 **self._columns(member, self.counters.rounds),
                 "task": self.tasks[task],
-                "return": episode.score,
-                "length": episode.length,
-                "fell": episode.fell,
-                **{name: float(x[member, task]) for name, x in diagnosis.items()},
+                "return": scores[-1],
+                "length": episode.length if healthy else 0,
+                "fell": healthy and episode.fell,
+                **(knowledge if healthy else dict.fromkeys(knowledge, math.nan)),
             }
             self.writer.write(row)
         evaluations = self.schedule.evaluations
@@ -458,7 +471,7 @@ class Run:
         # A long round may cross several multiples; they share one evaluation.
         steps = self.schedule.environment_steps(self.counters.rounds)
         self._advance(evaluations=steps // self.schedule.config.evaluate_every)
-        self._bar.update(last_return=np.mean(scores))
+        self._bar.update(last_return=_known_mean(scores))
 
     def _write_video(self, records: Records) -> None:
         frames = records.image[:MAXIMUM_VIDEO_MEMBERS]

@@ -137,9 +137,10 @@ def _write_mp4(path: Path, frames: np.ndarray, fps: float) -> None:
         stderr=subprocess.PIPE,
         process_group=0,  # Ctrl-C is for the run, which finishes its videos
     ) as process:
+        assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # its own message is better
             for frame in frames:
-                process.stdin.write(_enlarged(frame, even=True))
+                process.stdin.write(_enlarged(frame, even=True).data)
         message = process.communicate()[1].decode(errors="replace").strip()
     if process.returncode:
         raise OSError(f"could not write {path}: ffmpeg says {message or process.returncode}")

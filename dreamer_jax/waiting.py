@@ -23,4 +23,4 @@ def to_host(tree: Tree) -> Tree:
 
 
 def _is_ready(leaf: Any) -> bool:
-    return not isinstance(leaf, jax.Array) or leaf.is_ready()
+    return not isinstance(leaf, jax.Array) or leaf.is_ready()  # type: ignore[attr-defined]

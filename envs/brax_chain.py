@@ -99,7 +99,9 @@ class Chain:
         self._mass = np.asarray(inertia.mass, np.float32)
         self._centres = np.asarray(inertia.transform.pos, np.float32)
         turned = np.array([_rotation(q) for q in np.asarray(inertia.transform.rot)])
-        self._inertia = np.float32(turned @ np.asarray(inertia.i) @ turned.swapaxes(1, 2))
+        self._inertia = np.asarray(
+            turned @ np.asarray(inertia.i) @ turned.swapaxes(1, 2), np.float32
+        )
 
     def _nodes(self, system) -> None:
         """Each node's predecessor, what links and degrees of freedom it serves, and its matrices.
@@ -108,7 +110,12 @@ class Chain:
         """
         link, motion = system.link, system.dof.motion
         angular, linear = np.asarray(motion.ang), np.asarray(motion.vel)
-        before, matrices, last, node_of_dof, dof_link, offsets = [], [], [], [], [], []
+        before: list[int] = []
+        matrices: list[np.ndarray] = []
+        last: list[int] = []
+        node_of_dof: list[int] = []
+        dof_link: list[int] = []
+        offsets: list[np.ndarray] = []
         for number, (kind, parent) in enumerate(zip(system.link_types, self._parents, strict=True)):
             place = np.asarray(link.joint.pos[number], np.float64)
             transform = [
@@ -133,15 +140,18 @@ class Chain:
                 fixed = np.stack([np.eye(4), np.eye(4)])
             last.append(previous)
         self._before, self._last = before, np.array(last)
-        self._matrices = np.float32(np.stack(matrices, axis=1))
+        self._matrices = np.asarray(np.stack(matrices, axis=1), np.float32)
         self._node_of_dof, self._dof_link = np.array(node_of_dof), np.array(dof_link)
-        self._angular, self._linear = np.float32(angular), np.float32(linear)
+        self._angular, self._linear = (
+            np.asarray(angular, np.float32),
+            np.asarray(linear, np.float32),
+        )
         self._joints = np.asarray(link.joint.pos, np.float32)
-        self._offsets = np.float32(offsets)
+        self._offsets = np.asarray(offsets, np.float32)
 
     def _levels(self) -> None:
         """Nodes of one depth in the tree, for all of which one product is made."""
-        depth = []
+        depth: list[int] = []
         for node in self._before:
             depth.append(0 if node < 0 else depth[node] + 1)
         levels = [[i for i, d in enumerate(depth) if d == at] for at in range(max(depth) + 1)]
@@ -176,15 +186,15 @@ class Chain:
         halves = jnp.stack([angles, angles / 2], axis=2)[..., None, None]
         constant, sine, cosine, slide = self._matrices
         parts = constant + sine * jnp.sin(halves) + cosine * jnp.cos(halves) + slide * halves
-        frames = []
+        joined: list[jax.Array] = []
         for nodes, before in zip(self._level_nodes, self._level_before, strict=True):
             level = _chosen(parts, nodes)
-            if frames:
-                level = _product(_chosen(frames[-1], before), level)
+            if joined:
+                level = _product(_chosen(joined[-1], before), level)
             elif self._free:
                 level = _free_frame(q)[:, None]
-            frames.append(level)
-        frames = _chosen(jnp.concatenate(frames, axis=1), self._order)
+            joined.append(level)
+        frames = _chosen(jnp.concatenate(joined, axis=1), self._order)
         last = _chosen(frames, self._last)
         quaternions = last[:, :, 1, :, 0]
         rotations = frames[:, :, 0, :3, :3]
@@ -252,12 +262,12 @@ def _chosen(values: jax.Array, places) -> jax.Array:
     return jnp.concatenate([values[:, place : place + 1] for place in places], axis=1)
 
 
-def _product(one: jax.Array, other: jax.Array) -> jax.Array:
+def _product(one: jax.Array, other: jax.Array | np.ndarray) -> jax.Array:
     """Matrix products of [..., i, j] and [..., j, k], as one loop rather than many small calls."""
     return (one[..., :, :, None] * other[..., None, :, :]).sum(-2)
 
 
-def _turned(rotations: jax.Array, vectors: jax.Array) -> jax.Array:
+def _turned(rotations: jax.Array, vectors: jax.Array | np.ndarray) -> jax.Array:
     """Rotations [..., 3, 3] times vectors [..., 3]."""
     return (rotations * vectors[..., None, :]).sum(-1)
 
@@ -274,11 +284,11 @@ def _cross(one: jax.Array, other: jax.Array) -> jax.Array:
 def _free_frame(q: jax.Array) -> jax.Array:
     """Both matrices of a free joint, float32 [n, 2, 4, 4]; its quaternion need not be of length 1,
     and then scales."""
-    left = jnp.einsum("ijk,nk->nij", np.float32(_LEFT), q[:, 3:7])
-    right = jnp.einsum("ijk,nk->nij", np.float32(_RIGHT_INVERSE), q[:, 3:7])
+    left = jnp.einsum("ijk,nk->nij", np.asarray(_LEFT, np.float32), q[:, 3:7])
+    right = jnp.einsum("ijk,nk->nij", np.asarray(_RIGHT_INVERSE, np.float32), q[:, 3:7])
     turn = _product(left, right)[:, 1:, 1:]
     top = jnp.concatenate([turn, q[:, :3, None]], axis=2)
-    bottom = jnp.broadcast_to(np.float32([0, 0, 0, 1]), (len(q), 1, 4))
+    bottom = jnp.broadcast_to(np.asarray([0, 0, 0, 1], np.float32), (len(q), 1, 4))
     return jnp.stack([jnp.concatenate([top, bottom], axis=1), left], axis=1)
 
 

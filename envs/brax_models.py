@@ -74,7 +74,7 @@ def model_xml(title: str) -> str:
         ModuleNotFoundError: if Brax is not installed.
     """
     brax = importlib.util.find_spec("brax")
-    if brax is None:
+    if brax is None or not brax.submodule_search_locations:
         raise not_installed("brax")
     assets = Path(brax.submodule_search_locations[0], "envs/assets")
     root = ElementTree.parse(assets / f"{_LOOKS[title].file}.xml").getroot()
@@ -89,15 +89,15 @@ def model_xml(title: str) -> str:
 def painted_xml(title: str) -> str:
     """The model in the colours of the PyBullet tasks, under a white sky."""
     root = ElementTree.fromstring(model_xml(title))
-    root.find("compiler").attrib.pop("settotalmass", None)  # deprecated, and of no weight here
+    for compiler in root.findall("compiler"):
+        compiler.attrib.pop("settotalmass", None)  # deprecated, and of no weight here
     for geom in root.iter("geom"):
         if geom.get("material") == "geom":
             del geom.attrib["material"]
     for body, colour in zip(root.iter("body"), _LOOKS[title].colours, strict=True):
         for geom in body.findall("geom"):
             geom.set("rgba", f"{_COLOURS[colour]} 1")
-    world = root.find("worldbody")
-    for geom in world.findall("geom"):
+    for geom in root.findall("worldbody/geom"):
         colour = "1 1 1" if geom.get("material") else _COLOURS["g"]
         geom.set("rgba", f"{colour} 1")
     assets = root.find("asset")

@@ -123,6 +123,7 @@ class HostEnv:
         self.discrete = self.tasks[0].discrete
         self._calls = HostCalls()
         self._ticks = np.full(members * len(self.tasks), -1, np.int32)
+        self._resting = np.zeros(members * len(self.tasks), bool)
         self._pool = SimulatorPool(
             self.tasks * members, image_size, action_size, action_repeat, workers, timeout
         )
@@ -147,6 +148,21 @@ class HostEnv:
         row = action_words(state, action, self.action_size)
         return _time_step(state.slot, *self._call_step(row))
 
+    def rest(self, slots: np.ndarray) -> None:
+        """Let slots idle: their images are black and their rewards 0, and no simulator runs.
+
+        Args:
+            slots: bool [P * K]; those that are False are simulated from their next reset on.
+        """
+        slots = np.asarray(slots, bool)
+        if slots.shape != self._resting.shape:
+            raise ValueError(
+                f"got a mask of {slots.shape} slots, expected {self._resting.shape} "
+                f"({self.members} members x {len(self.tasks)} tasks)"
+            )
+        jax.effects_barrier()
+        self._resting = slots.copy()
+
     def check(self) -> None:
         """Wait for callbacks under way and raise the error that one of them met, if any.
 
@@ -169,8 +185,9 @@ class HostEnv:
         slots, keys = words[:, 0], words[:, 1:].view(np.uint32)
         self._check_slots(slots)
         self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
-        time_step = self._pool.reset(slots, keys)
-        return _host_results(self._ticks[slots], time_step)
+        time_step = self._simulated(self._pool.reset, slots, keys)
+        first = np.ones(len(slots), bool)
+        return _host_results(self._ticks[slots], time_step._replace(first=first))
 
     def _host_step(self, words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slots, ticks, actions = words[:, 0], words[:, 1], words[:, 2:].view(np.float32)
@@ -184,13 +201,31 @@ class HostEnv:
                 f"simulator is at tick {now[stale][0]}: a state can be stepped once, and each "
                 "step must use the one before's"
             )
-        if (bad := ~np.isfinite(actions).all(axis=1)).any():
+        if (bad := ~(np.isfinite(actions).all(axis=1) | self._resting[slots])).any():
             raise SimulatorError(
                 f"{self._name(slots[bad][0])} got an action that is not finite: {actions[bad][0]}"
             )
         self._ticks[slots] += 1  # even if the next line fails: earlier tokens are then stale
-        time_step = self._pool.step(slots, actions)
-        return _host_results(self._ticks[slots], time_step)
+        return _host_results(self._ticks[slots], self._simulated(self._pool.step, slots, actions))
+
+    def _simulated(
+        self, call: Callable[..., TimeStep], slots: np.ndarray, argument: np.ndarray
+    ) -> TimeStep:
+        """What the pool answers for the slots that do not rest; blank ticks for those that do."""
+        awake = ~self._resting[slots]
+        if awake.all():
+            return call(slots, argument)
+        count, size = len(slots), self.image_size
+        ticks = TimeStep(
+            image=np.zeros((count, size, size, 3), np.uint8),
+            reward=np.zeros(count, np.float32),
+            first=np.zeros(count, bool),
+            terminal=np.zeros(count, bool),
+        )
+        if awake.any():
+            for values, played in zip(ticks, call(slots[awake], argument[awake]), strict=True):
+                values[awake] = played
+        return ticks
 
     def _name(self, slot: int) -> str:
         return f"slot {slot} ({self._pool.tasks[slot].name})"

@@ -42,7 +42,8 @@ class _DoublePendulumHanging(robot_pendula.InvertedDoublePendulum):
 
     def robot_specific_reset(self, bullet_client):
         super().robot_specific_reset(bullet_client)
-        hinge_offset, hinge2_offset = self.np_random.uniform(low=-0.1, high=0.1, size=2)
+        random: np.random.Generator = self.np_random  # type: ignore[attr-defined]
+        hinge_offset, hinge2_offset = random.uniform(low=-0.1, high=0.1, size=2)
         self.j1.reset_current_position(float(np.pi + hinge_offset), 0)
         self.j2.reset_current_position(float(hinge2_offset), 0)
         self.j1.set_motor_torque(0)

@@ -68,7 +68,7 @@ def _traits(id: str) -> _Traits:
         action_size=_action_size(name, actions),
         simulator="envs.gymnasium_simulator:GymnasiumSimulator",
         gymnasium_id=id,
-        time_limit=env.spec.max_episode_steps or TaskSpec.time_limit,
+        time_limit=(env.spec and env.spec.max_episode_steps) or TaskSpec.time_limit,
         step_seconds=1 / (frames or 30),
         discrete=isinstance(actions, Discrete),
     )
@@ -160,6 +160,7 @@ class GymnasiumSimulator:
         space = self._env.action_space
         if isinstance(space, Discrete):
             return int(space.start + np.argmax(action))
+        assert isinstance(space, Box)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         share = (np.clip(action, -1.0, 1.0).reshape(space.shape) + 1) / 2
         return np.clip(low + share * (high - low), low, high).astype(space.dtype)
@@ -181,13 +182,13 @@ class GymnasiumSimulator:
 def _checked(image, what: str) -> np.ndarray:
     """An environment's picture, if it is one: cast in silence, others would turn black."""
     array = np.asarray(image) if isinstance(image, np.ndarray | list | tuple) else None
-    fits = array is not None and array.dtype == np.uint8 and array.ndim in (2, 3) and array.size
-    if not fits or (array.ndim == 3 and array.shape[2] not in (1, 3)):
-        found = repr(image)[:80] if array is None else f"{array.dtype} {list(array.shape)}"
-        raise SimulatorError(
-            f"the environment's {what} is {found}, expected uint8 [height, width, 1 or 3]"
-        )
-    return array
+    if array is not None and array.dtype == np.uint8 and array.size:
+        if array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (1, 3)):
+            return array
+    found = repr(image)[:80] if array is None else f"{array.dtype} {list(array.shape)}"
+    raise SimulatorError(
+        f"the environment's {what} is {found}, expected uint8 [height, width, 1 or 3]"
+    )
 
 
 def resize(image: np.ndarray, size: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Env, TimeStep
 from envs.rows import Layout, action_words, apply_by_group, key_words, mapped_rows
@@ -47,6 +48,7 @@ class MixedEnv:
         # For each task, its environment and its number there.
         self._part_of = [0] * self._tasks
         self._numbers = [[-1] * self._tasks for _ in parts]
+        self._places = [list(tasks) for tasks in places]
         self._counts = [len(tasks) for tasks in places]
         for index, tasks in enumerate(places):
             for number, task in enumerate(tasks):
@@ -65,6 +67,13 @@ class MixedEnv:
     def step(self, state: MixedState, action: jax.Array) -> tuple[MixedState, TimeStep]:
         """One tick with `action` (float32 [A])."""
         return self._step(action_words(state, action, self.action_size))
+
+    def rest(self, slots: np.ndarray) -> None:
+        """Let slots idle (bool [P * K]) in the environments whose simulators can."""
+        by_task = np.asarray(slots, bool).reshape(self.members, self._tasks)
+        for part, places in zip(self.parts, self._places, strict=True):
+            if hasattr(part, "rest"):
+                part.rest(by_task[:, places].reshape(-1))
 
     def check(self) -> None:
         """Raise the first error that one of the environments met, if any; forget the others."""

@@ -216,7 +216,8 @@ class SimulatorPool:
             os.sched_yield()
         while pending:
             # Woken now and then, since a fork of a dead worker may keep its connection open.
-            for connection in wait(list(pending), timeout=1.0) or list(pending):
+            ready = wait(list(pending), timeout=1.0)
+            for connection in [x for x in pending if x in ready] or list(pending):
                 worker = self._workers[pending[connection]]
                 try:
                     if connection.poll():
@@ -280,8 +281,8 @@ def _start(tasks: dict[int, TaskSpec], memory_descriptor: int) -> _Worker:
     output = tempfile.TemporaryFile()
     # The system ends a process with the thread that started it, so that thread has to last.
     lasting = threading.current_thread() is threading.main_thread()
-    arguments = [theirs.fileno(), memory_descriptor, os.getpid() if lasting else 0]
-    arguments = [*map(str, arguments), *map(os.path.abspath, sys.path)]
+    numbers = (theirs.fileno(), memory_descriptor, os.getpid() if lasting else 0)
+    arguments = [*map(str, numbers), *map(os.path.abspath, sys.path)]
     with theirs:
         process = subprocess.Popen(
             [sys.executable, "-c", _BOOTSTRAP, *arguments],

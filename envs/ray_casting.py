@@ -209,7 +209,9 @@ def _hit_cylinder(size, origin, ray):
 
 
 def _hit_box(size, origin, ray):
-    enter, leave, faces = -_FAR_AWAY, _FAR_AWAY, []
+    enter: Any = -_FAR_AWAY
+    leave: Any = _FAR_AWAY
+    faces = []
     for o, d, half in zip(origin, ray, size, strict=True):
         d = jnp.where(jnp.abs(d) < 1e-12, 1e-12, d)
         middle, reach = -o / d, jnp.abs(half / d)
@@ -253,7 +255,11 @@ def _cast(scene: Scene, frames, wide: int):
     step = 2 * math.tan(math.radians(camera.field_of_view) / 2) / wide
     right, up = (jnp.asarray(x.reshape(-1), jnp.float32) for x in np.meshgrid(across, -across))
     depth = jnp.full(wide * wide, _FAR_AWAY)
-    normal, colour, pattern, gloss, shininess = [0.0] * 3, [0.0] * 3, [1.0] * 3, 0.0, 1.0
+    normal: list[Any] = [0.0] * 3
+    colour: list[Any] = [0.0] * 3
+    pattern: list[Any] = [1.0] * 3
+    gloss: Any = 0.0
+    shininess: Any = 1.0
     checkered = any(geometry.checker for geometry in scene.geometries)
     for geometry, frame in zip(scene.geometries, frames, strict=True):
         ray = [row[0] * right + row[1] * up + row[2] for row in frame]
@@ -312,9 +318,11 @@ def _lit(scene: Scene, eye, point, normal, colour, gloss, shininess):
     """The colours of surfaces in the light, as OpenGL's fixed functions give them."""
     axes = scene.camera.axes()
     exponents = sorted({geometry.shininess for geometry in scene.geometries})
-    diffuse, shine = [0.0] * 3, [0.0] * 3
+    diffuse: list[Any] = [0.0] * 3
+    shine: list[Any] = [0.0] * 3
     for light in scene.lights:
-        weight = 1.0
+        weight: Any = 1.0
+        towards: list[Any]
         if light.kind == "head":
             towards = [0.0, 0.0, -1.0]
         elif light.kind == "directional":

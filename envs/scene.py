@@ -201,7 +201,8 @@ def scene_of(model: Any, camera: Camera | None = None) -> Scene:
     lights = [_light(model, index) for index in range(model.nlight) if model.light_active[index]]
     head = model.vis.headlight
     if head.active:
-        lights.insert(0, Light("head", *map(_floats, (head.diffuse, head.ambient, head.specular))))
+        diffuse, ambient, specular = map(_vector, (head.diffuse, head.ambient, head.specular))
+        lights.insert(0, Light("head", diffuse, ambient, specular))
     skies = [_sky(model, index) for index in range(model.ntex) if _is_sky(model, index)]
     return Scene(
         geometries=tuple(_geometry(model, index) for index in seen),
@@ -211,13 +212,19 @@ def scene_of(model: Any, camera: Camera | None = None) -> Scene:
     )
 
 
-def _floats(values) -> tuple[float, ...]:
-    return tuple(float(x) for x in values)
+def _vector(values) -> Vector:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
-def _rgba(model, index: int) -> tuple[float, ...]:
-    own, material = _floats(model.geom_rgba[index]), model.geom_matid[index]
-    return _floats(model.mat_rgba[material]) if material >= 0 and own == _GREY else own
+def _four(values) -> tuple[float, float, float, float]:
+    first, second, third, fourth = map(float, values)
+    return first, second, third, fourth
+
+
+def _rgba(model, index: int) -> tuple[float, float, float, float]:
+    own, material = _four(model.geom_rgba[index]), model.geom_matid[index]
+    return _four(model.mat_rgba[material]) if material >= 0 and own == _GREY else own
 
 
 def _geometry(model, index: int) -> Geometry:
@@ -230,7 +237,7 @@ def _geometry(model, index: int) -> Geometry:
             f"cannot draw the {kind} {name!r} of the body {body!r}: expected {', '.join(KINDS)}. "
             "Give it a group above 2, or the colour's alpha 0, to leave it out"
         )
-    kind, size = _KINDS[number], _floats(model.geom_size[index])
+    kind, size = _KINDS[number], _vector(model.geom_size[index])
     colour, checker, gloss = _rgba(model, index)[:3], None, {}
     if material >= 0:
         gloss = {
@@ -243,7 +250,7 @@ def _geometry(model, index: int) -> Geometry:
             pixels = _texture(model, texture)
             fields = _fields(pixels) if kind == "plane" else None
             if fields is None:
-                colour = _floats(np.multiply(colour, _mean(pixels)))
+                colour = _vector(np.multiply(colour, _mean(pixels)))
             else:
                 # Textures begin at a corner of the plane, or in the middle of an endless one.
                 corner = (-size[0], size[1])
@@ -253,8 +260,8 @@ def _geometry(model, index: int) -> Geometry:
         size=size,
         colour=colour,
         link=int(model.geom_bodyid[index]) - 1,
-        position=_floats(model.geom_pos[index]),
-        rotation=_floats(model.geom_quat[index]),
+        position=_vector(model.geom_pos[index]),
+        rotation=_four(model.geom_quat[index]),
         checker=checker,
         **gloss,
     )
@@ -269,11 +276,11 @@ def _light(model, index: int) -> Light:
         )
     return Light(
         kind=_LIGHTS[number],
-        diffuse=_floats(model.light_diffuse[index]),
-        ambient=_floats(model.light_ambient[index]),
-        specular=_floats(model.light_specular[index]),
-        direction=_floats(model.light_dir0[index]),
-        position=_floats(model.light_pos0[index]),
+        diffuse=_vector(model.light_diffuse[index]),
+        ambient=_vector(model.light_ambient[index]),
+        specular=_vector(model.light_specular[index]),
+        direction=_vector(model.light_dir0[index]),
+        position=_vector(model.light_pos0[index]),
         cutoff=180.0 if number == _POINT else float(model.light_cutoff[index]),
         exponent=0.0 if number == _POINT else float(model.light_exponent[index]),
     )
@@ -282,7 +289,7 @@ def _light(model, index: int) -> Light:
 def _first_camera(model) -> Camera:
     view, extent = model.vis.global_, float(model.stat.extent)
     return Camera(
-        target=_floats(model.stat.center),
+        target=_vector(model.stat.center),
         distance=1.5 * extent,
         azimuth=float(view.azimuth),
         elevation=float(view.elevation),
@@ -319,7 +326,7 @@ def _texture(model, index: int) -> np.ndarray:
 
 
 def _mean(pixels: np.ndarray) -> Vector:
-    return _floats(pixels.mean((0, 1)))
+    return _vector(pixels.mean((0, 1)))
 
 
 def _fields(pixels: np.ndarray) -> tuple[Vector, Vector] | None:
@@ -337,8 +344,9 @@ def _fields(pixels: np.ndarray) -> tuple[Vector, Vector] | None:
 def _field_widths(model, material: int, size: Vector) -> tuple[float, float]:
     """Widths along x and y of one of a texture's 2 x 2 fields on a plane, in metres."""
     repeats = model.mat_texrepeat[material]
-    widths = []
-    for half, repeat in zip(size[:2], repeats, strict=True):
+
+    def width(half: float, repeat: float) -> float:
         endless = model.mat_texuniform[material] or half == 0
-        widths.append(float((1.0 if endless else half) / repeat))
-    return tuple(widths)
+        return float((1.0 if endless else half) / repeat)
+
+    return width(size[0], repeats[0]), width(size[1], repeats[1])

@@ -97,27 +97,29 @@ class Phase:
     def reset(self, key: Sequence[int]) -> TimeStep:
         """Start a phase whose episodes are seeded by `key`, any number of 32-bit words."""
         self.close()
-        self._simulator = self._make_simulator()
+        self._simulator = simulator = self._make_simulator()
         self._key = key
         self._episode = 0
-        return self._start_episode()
+        return self._start_episode(simulator)
 
-    def _start_episode(self) -> TimeStep:
+    def _start_episode(self, simulator: Simulator) -> TimeStep:
         words = np.random.SeedSequence([*self._key, self._episode]).generate_state(4)
         self._episode += 1
         self._ticks = 0
-        self._simulator.reset(int.from_bytes(words.tobytes(), "little"))
+        simulator.reset(int.from_bytes(words.tobytes(), "little"))
         self._ended = False
-        return TimeStep(self._simulator.render(), 0.0, True, False)
+        return TimeStep(simulator.render(), 0.0, True, False)
 
     def step(self, action: np.ndarray) -> TimeStep:
         """One tick: hold `action`, or start the next episode if the last one has ended."""
+        simulator = self._simulator
+        assert simulator is not None, "a phase begins with a reset"
         if self._ended:
-            return self._start_episode()
+            return self._start_episode(simulator)
         self._ticks += 1
-        outcome = self._simulator.step(action)
+        outcome = simulator.step(action)
         self._ended = outcome.terminal or outcome.truncated
-        return TimeStep(self._simulator.render(), outcome.reward, False, outcome.terminal)
+        return TimeStep(simulator.render(), outcome.reward, False, outcome.terminal)
 
     def close(self) -> None:
         if self._simulator is not None:

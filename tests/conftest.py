@@ -15,3 +15,26 @@ _flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
 if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
     _flags.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join(_flags).strip()
+
+LONGEST = (
+    "test_brax",
+    "test_tables",
+    "test_methods_command_line",
+    "test_agent",
+    "test_training",
+    "test_command_line",
+    "test_precision",
+    "test_transfer_safety",
+    "test_transfer_plan",
+    "test_transfer_merging",
+    "test_envs",
+    "test_two_cores",
+    "test_golden",
+    "test_package",
+)
+"""Files that take a worker longest come first, so that none is begun when the rest is done."""
+
+
+def pytest_collection_modifyitems(items):
+    place = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))

@@ -136,6 +136,44 @@ def test_vmap_over_any_axis_reaches_the_same_simulators(population):
     np.testing.assert_array_equal(start.image.reshape(again.image.shape), again.image)
 
 
+def test_slots_that_rest_are_not_simulated_and_the_others_go_on_as_before(population, monkeypatch):
+    @jax.jit
+    def phase(keys):
+        state, start = jax.vmap(population.reset)(jnp.arange(6), keys)
+        step = jax.vmap(population.step, in_axes=(0, None))
+        return start, jax.lax.scan(lambda s, _: step(s, jnp.ones(3)), state, None, 4)[1]
+
+    def chosen(found, slots):
+        start, ticks = found
+        return jax.tree.map(lambda x: x[slots], start), jax.tree.map(lambda x: x[:, slots], ticks)
+
+    keys, asked = jax.random.split(KEY, 6), []
+    whole = phase(keys)
+    request = population._pool._request
+    monkeypatch.setattr(
+        population._pool,
+        "_request",
+        lambda command, slots, rest: asked.append(slots.tolist()) or request(command, slots, rest),
+    )
+    population.rest(np.array([0, 0, 1, 1, 0, 0], bool))
+    start, ticks = phase(keys)
+    population.check()
+    assert asked == [[0, 1, 4, 5]] * 5
+    others = np.array([0, 1, 4, 5])
+    found = chosen((start, ticks), others)
+    jax.tree.map(np.testing.assert_array_equal, found, chosen(whole, others))
+    # A phase of one that rests has one episode, in which nothing happens.
+    assert start.first.all() and not ticks.first[:, 2:4].any()
+    for values in (ticks.image, ticks.reward, ticks.terminal):
+        assert not values[:, 2:4].any()
+    population.rest(np.ones(6, bool))
+    assert not phase(keys)[1].image.any() and len(asked) == 5
+    population.rest(np.zeros(6, bool))
+    jax.tree.map(np.testing.assert_array_equal, phase(keys), whole)
+    with pytest.raises(ValueError, match=r"\(5,\) slots, expected \(6,\)"):
+        population.rest(np.zeros(5, bool))
+
+
 def test_one_shared_key_still_gives_every_member_its_own_simulator(population):
     @jax.jit
     def phase(key):

@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.logs import read_metrics
-from experiments.__main__ import main
+from experiments.cli.main import main
 from experiments.runs.agents import load_source
 from experiments.runs.latents import own_latents
 from experiments.runs.start import load_sources

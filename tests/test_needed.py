@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.__main__ import main
+from experiments.cli.main import main
 from experiments.reports import needed
 from experiments.reports.outcomes import read_outcomes
 from experiments.thesis import grid

@@ -26,11 +26,9 @@ PIXEL = base64.b64decode(
 )
 
 
-@pytest.fixture
-def root(tmp_path):
+def make_root(root):
     """Four evaluations a run: five seeds from scratch and of ω = 0, where one failed of ω = 0.1;
     ω = 0.2 was cut."""
-    root = tmp_path / "debug"
     write_folder(root, "scratch", baselines(SEEDS), rising)
     write_folder(root, "targets", targets([0.0], SEEDS), rising)
     write_folder(root, "failed", targets([0.1], SEEDS), rising, failed=[3])
@@ -38,17 +36,9 @@ def root(tmp_path):
     return root
 
 
-@pytest.fixture(autouse=True)
-def classification(monkeypatch):
-    """What latent task classification gives: nothing, unless a test puts tables in here."""
-    found = {}
-    for module in (page, sheet):
-        monkeypatch.setattr(
-            module,
-            "read_classification",
-            lambda root, table, seeds=grid.SEEDS: found.get(table.name),
-        )
-    return found
+@pytest.fixture
+def root(tmp_path):
+    return make_root(tmp_path / "debug")
 
 
 def classified(table):
@@ -60,9 +50,8 @@ def classified(table):
     return Classification(table, 100, 23, shares)
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that a page asks for, drawn as a single pixel."""
+def draw_pixels(monkeypatch):
+    """Has figures drawn as a single pixel; gives the names of those that are asked for."""
     found = []
 
     def draw(figure, *arguments, **settings):
@@ -78,15 +67,30 @@ def drawn(monkeypatch):
 
 
 @pytest.fixture
-def text(root, drawn, classification, tmp_path):
-    """A page of the made-up results, with a video."""
-    classification["table-13"] = classified(TABLES["table-13"])
+def drawn(monkeypatch):
+    return draw_pixels(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A page of the made-up results, with a video and a classification, and its figures' names."""
+    folder = tmp_path_factory.mktemp("page")
+    root, table = make_root(folder / "debug"), TABLES["table-13"]
     frames = np.zeros((3, 16, 16, 3), np.uint8)
     for steps in (40, 160):
         write_video(root / "scratch" / "videos" / f"evaluation_{steps:09d}.mp4", frames)
-    path = page.write_page(root, SEEDS, "bullet", tmp_path / "deep" / "index.html")
-    assert path == tmp_path / "deep" / "index.html"
-    return path.read_text(encoding="utf-8")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        found = draw_pixels(monkeypatch)
+        one = {table.name: classified(table)}
+        monkeypatch.setattr(page, "read_classification", lambda root, t, seeds: one.get(t.name))
+        path = page.write_page(root, SEEDS, "bullet", folder / "deep" / "index.html")
+    assert path == folder / "deep" / "index.html"
+    return path.read_text(encoding="utf-8"), found
+
+
+@pytest.fixture(scope="module")
+def text(made):
+    return made[0]
 
 
 def section(text, id):
@@ -161,7 +165,8 @@ def test_noise_is_told_as_no_difference(tmp_path, drawn):
 # --- tables and figures ---------------------------------------------------------------------------
 
 
-def test_a_page_leads_to_each_table_and_figure_of_which_something_was_run(text, drawn):
+def test_a_page_leads_to_each_table_and_figure_of_which_something_was_run(made):
+    text, drawn = made
     shown = {"table-7", "table-8", "table-13", "figure-10", "figure-11", "figure-21", "figure-36"}
     assert set(drawn) == {name for name in shown if name.startswith("figure")}
     for name in (*TABLES, *FIGURES):

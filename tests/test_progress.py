@@ -5,7 +5,7 @@ import io
 import pytest
 
 from dreamer_jax import progress as progress_module
-from dreamer_jax.progress import Progress
+from dreamer_jax.progress import Progress, reported
 
 
 @pytest.fixture
@@ -85,3 +85,15 @@ def test_on_a_terminal_there_is_a_live_bar_that_fits_it(monkeypatch):
 def test_a_run_without_updates_or_steps_is_no_division_by_zero():
     with Progress(0, 0, stream=io.StringIO()) as progress:
         progress.update(env_steps=0, updates=0)
+
+
+def test_a_report_draws_a_bar_from_its_first_call_on(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with reported("playing"):
+        pass
+    assert "playing" not in capsys.readouterr().out
+    with reported("playing") as report:
+        report(1, 4, "")
+        report(3, 4, "return 12")
+    shown = capsys.readouterr().out
+    assert "playing, return 12" in shown and "75%" in shown

@@ -6,7 +6,7 @@ import pytest
 
 from dreamer_jax.config import preset
 from dreamer_jax.files import write_json_atomically
-from experiments.__main__ import main
+from experiments.cli.main import main
 from experiments.methods.fractional import FractionalTransfer
 from experiments.methods.scratch import Scratch
 from experiments.reports import summary, tidy

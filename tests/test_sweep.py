@@ -149,6 +149,7 @@ def test_what_a_run_compiled_is_freed_after_it(tmp_path, monkeypatch):
 TASKS = ("bullet/hopper", "bullet/walker2d", "bullet/halfcheetah")
 SPEED = Speed(
     update_seconds=0.5,
+    update_range=(0.4, 1.0),
     update_bytes=1000,
     policy_seconds=0.0,
     tick_seconds=dict.fromkeys(TASKS, 0.01),
@@ -243,13 +244,30 @@ def test_the_plan_names_runs_needs_states_and_totals(tmp_path):
     finish(source, tmp_path)
     (tmp_path / "elsewhere").mkdir()
     lines = plan_table(plan(tmp_path), SPEED).splitlines()
-    rows = {line.split()[1]: line.split() for line in lines[2:-1]}
+    rows = {}
+    for line in lines[2:-1]:
+        first, *others = line.split()
+        if first.isdecimal():
+            rows[others[0]] = [first, *others[1:]]
+            name = others[0]
+        else:  # the rest of a long name
+            rows[name + first] = rows.pop(name)
+            name += first
     assert set(rows) == {run.name for run in plan(tmp_path)}
-    assert rows[HOPPERS_SOURCE][-4:] == ["done", "-", "-", "-"]
-    hopper = rows[HOPPER]
-    assert hopper[2:6] == ["6", "bullet/hopper", rows[HOPPERS_SOURCE][0], "missing"]
+    assert max(map(len, lines)) <= 100
+    number, *source_row = rows[HOPPERS_SOURCE]
+    assert source_row[-4:] == ["done", "-", "-", "-"]
+    assert rows[HOPPER][1:4] == ["6", number, "missing"]
     agents = sum(len(run.cells) for run in plan(tmp_path))
     assert lines[-1].split()[:2] == ["together", str(agents)]
+
+
+def test_times_are_ranges_of_the_measured_updates_and_of_what_is_not_counted():
+    # The fastest tenth takes 0.8 of the middle one, the slowest twice, and half as much again.
+    assert estimate.span(100.0, SPEED) == "1.3 to 5.0 min"
+    assert estimate.span(10.0, SPEED) == "8 to 30 s"
+    assert estimate.span(20_000.0, SPEED) == "4.4 to 16.7 h"
+    assert estimate.span(1e6, SPEED) == "9.3 to 34.7 days"
 
 
 def test_a_plan_of_what_is_done_needs_no_measurement(tmp_path):

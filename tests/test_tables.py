@@ -10,8 +10,8 @@ import pytest
 import envs
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
-from experiments.__main__ import main
 from experiments.cli import reports, thesis
+from experiments.cli.main import main
 from experiments.reports.classification import read_classification
 from experiments.reports.outcomes import read_outcomes
 from experiments.runs.folder import folders, latents_folder

@@ -248,7 +248,8 @@ def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_withou
     finished, tmp_path, capsys, monkeypatch
 ):
     directory, whole = finished
-    original, updates = training.update_members, []
+    original, updates, rested = training.update_members, [], []
+    monkeypatch.setattr(Probe, "rest", lambda self, slots: rested.append(slots.tolist()), False)
 
     def poisoning(agent, state, sums, batch, **options):
         updates.append(jax.tree.map(lambda x: np.array(x[1]), state.params))
@@ -266,8 +267,17 @@ def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_withou
 
     rows, others = ([r for r in read_metrics(d)] for d in (tmp_path, directory))
     assert [r for r in rows if r["member"] == 0] == [r for r in others if r["member"] == 0]
-    healthy = [r["healthy"] for r in rows if r["member"] == 1 and r["kind"] == "update"]
-    assert healthy == [True, False, False, False]
+    second = [r for r in rows if r["member"] == 1]
+    # Four updates in, after the second evaluation; what it would have played is told as unknown.
+    for kind, healthy in (
+        ("update", [True, False, False, False]),
+        ("evaluation", [True, False, False, False]),
+        ("collect", [True, True, False, False]),
+    ):
+        found = [r for r in second if r["kind"] == kind]
+        assert [r["healthy"] for r in found] == healthy, kind
+        assert [np.isfinite(r["return"]) for r in found if "return" in r] in ([], healthy)
+    assert rested == [[False, healthy] for healthy in (False,) * 3 + (True,) * 5]
     # Bit for bit: the one as in the run without an accident, the other as before its own.
     first, second = (jax.tree.map(lambda x, p=p: x[p], run.state) for p in range(2))
     chex.assert_trees_all_equal(first, jax.tree.map(lambda x: x[0], whole.state))

@@ -26,7 +26,10 @@ from dreamer_jax.records import Records
 
 members, (batch, length, size, actions) = 3, (2, 5, 32, 2)
 agent = Agent(preset("debug"), actions)
-state = init_members(agent, jnp.arange(members))
+# Compiled quickly. Not by an environment variable: there is none that a user must know.
+quick = {"xla_backend_optimization_level": 0}
+seeds = jnp.arange(members)
+state = init_members.lower(agent, seeds).compile(quick)(seeds)
 shape = (members, batch, length)
 batches = Records(
     np.zeros((*shape, size, size, 3), np.uint8),
@@ -36,7 +39,9 @@ batches = Records(
     np.zeros(shape, bool),
 )
 sums = zero_sums(agent, state, batch, length)
-state, _, loss = update_members(agent, state, sums, batches, mapping="auto", chunk=1)
+options = dict(mapping="auto", chunk=1)
+update = update_members.lower(agent, state, sums, batches, **options).compile(quick)
+state, _, loss = update(state, sums, batches)
 print("updated", state.updates.tolist(), bool(jnp.isfinite(loss).all()))
 """
 

@@ -31,6 +31,8 @@ class Export:
     """A sentence for the card."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,13 @@ class Zoo:
 
 def export(command: Export) -> int:
     """Writes an agent and its card."""
-    from rich.progress import Progress
-
+    from dreamer_jax.progress import reported
     from experiments.runs.export import export
+    from experiments.runs.trust import check_trust
 
-    with usage_errors(), Progress() as bar:
-        job = bar.add_task("playing", total=command.episodes)
+    with usage_errors():
+        check_trust([command.directory], command.trust)
+    with usage_errors(), reported("playing") as report:
         card = export(
             command.directory,
             command.out,
@@ -59,9 +62,7 @@ def export(command: Export) -> int:
             episodes=command.episodes,
             note=command.note,
             workers=command.workers,
-            report=lambda done, score: bar.update(
-                job, completed=done, description=f"playing, return {score:.0f}"
-            ),
+            report=report,
         )
     for task in card.spec.tasks:
         print(f"{task}: {card.verdict(task)}")

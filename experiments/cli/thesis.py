@@ -35,10 +35,15 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
+    compared: tuple[str, ...] = ()
+    """Other methods to train, too, from the same sources (any of fine-tuning, frozen-source), for
+    rows of their own in tables of fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    yes: bool = False
+    """At a terminal: begin without a question, however long it takes."""
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
     file: ConfigFile = None
@@ -79,20 +84,24 @@ class Plan:
     """Show the runs that tables and figures need, and what they will take, without running them.
 
     Time, memory and disk are estimates, from a short measurement on this machine: half a minute
-    for each simulator and one for updates, most of it compilation.
+    for each simulator and one for updates, most of it compilation. It is made once for a machine
+    and its settings, and kept.
     """
 
     table: tuple[str, ...] = ()
     """Numbers of tables (1 to 17), or all."""
     figure: tuple[str, ...] = ()
     """Numbers of figures (10 to 39), or all."""
+    measure: bool = False
+    """Measure this machine anew."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
 
 
 def _sweep(base: Base) -> Sweep:
     """The defaults of a sweep."""
     if strange := sorted(set(base.values) - {"preset", "seeds", "config"}):
-        raise ValueError(f"{base.file}: the settings {', '.join(strange)} are those of a table")
+        told = ", ".join(strange)
+        raise ValueError(f"{base.file}: the settings {told} are not those of a table")
     seeds = sequence(base.values, "seeds", grid.SEEDS)
     return Sweep(preset=base.preset, file=base.file, seeds=seeds, config=base.config)
 
@@ -141,7 +150,7 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    return _make(entries, command.sweep)
+    return _make([_beside(entry, command.sweep) for entry in entries], command.sweep)
 
 
 def figures(command: Figures) -> int:
@@ -158,6 +167,13 @@ def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
     return dataclasses.replace(entry, omegas=omegas, counts=counts)
 
 
+def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
+    """A table of fractional transfer with the methods of comparison that are asked for."""
+    if isinstance(entry, Table) and entry.kind == "ftl":
+        return dataclasses.replace(entry, compared=sweep.compared)
+    return entry
+
+
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
     """The runs behind tables and figures."""
     from experiments.thesis.graph import plan_runs
@@ -171,6 +187,8 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
+        if not set(sweep.compared) <= set(grid.COMPARED):
+            raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
         entries = [_restricted(entry, sweep) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
         return plan_runs(cells, sweep.config, sweep.root)
@@ -223,32 +241,80 @@ def plan(command: Plan) -> int:
             *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
             *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
         ]
-    runs = _planned(entries, sweep)
-    due = [run for run in runs if run.state in ("missing", "cut")]
-    speed = None
-    if due:
-        print("measuring how fast this machine is:", file=sys.stderr)
-        speed = estimate.measure(
-            (run.spec for run in due), lambda what: print(f"  {what}", file=sys.stderr, flush=True)
-        )
+    runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
+    known = _speed(runs, again=command.measure)
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
-    print(estimate.plan_table(runs, speed))
-    if speed is not None:
+    print(estimate.plan_table(runs, known and known.speed))
+    if known is not None:
+        ticks = 1000 * max(known.speed.tick_seconds.values())
+        when = f"kept in {known.path} (--measure measures anew)" if known.kept else "here and now"
         print(
-            f"\nAn estimate, from {speed.update_seconds:.3g} s for an update of one agent and "
-            f"{1000 * max(speed.tick_seconds.values()):.1f} ms for a tick of\nthe slowest "
-            "simulator here and now. Runs come one after another; each is compiled first."
+            f"\nAn estimate, from {known.speed.update_seconds:.3g} s for an update of one agent "
+            f"and {ticks:.1f} ms for a tick of the\nslowest simulator, measured {when}.\n"
+            "Runs come one after another; each is compiled first."
         )
     return 0
 
 
+LONG_SECONDS = 3600.0
+"""What takes longer is begun at a terminal only after a question."""
+
+
+def _speed(runs, again: bool = False):
+    """How fast this machine is at the runs that are due; None if none is."""
+    from experiments.thesis.estimate import DUE
+    from experiments.thesis.speeds import cache_folder, speed_of
+
+    due = [run.spec for run in runs if run.state in DUE]
+    if not due:
+        return None
+
+    def report(number: int, count: int, what: str) -> None:
+        if number == 1:
+            print("measuring how fast this machine is:", file=sys.stderr)
+        print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
+
+    return speed_of(due, cache_folder(), again=again, report=report)
+
+
+def _may_begin(runs) -> bool:
+    """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
+    from dreamer_jax.schedule import Schedule
+    from experiments.thesis import estimate
+
+    due = [run for run in runs if run.state in estimate.DUE]
+    updates = sum(
+        Schedule(run.spec.config.schedule, len(run.spec.tasks)).updates * len(run.spec.members)
+        for run in due
+    )
+    # An update that takes a second is one of the largest sizes on a machine without accelerator.
+    if updates < LONG_SECONDS:
+        return True
+    speed = _speed(runs).speed
+    total = estimate.together(runs, speed)
+    if total.seconds < LONG_SECONDS:
+        return True
+    agents = sum(len(run.cells) for run in due)
+    print(
+        f"{len(due)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
+        "They can be stopped with\nCtrl-C and go on with the same command; plan shows them one by "
+        "one, --yes begins without asking."
+    )
+    try:
+        return input("Begin? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
+
+
 def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     """Trains what is missing and writes tables and figures."""
-    from rich.progress import Progress
-
+    from dreamer_jax.progress import reported
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
+    if not sweep.yes and sys.stdin.isatty() and not _may_begin(_planned(entries, sweep)):
+        print("nothing was begun")
+        return STOPPED
     runs, progress = _carry_out(entries, sweep)
     if progress.stopped:
         return STOPPED
@@ -261,17 +327,14 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
             progress.skipped[entry.name] = f"it needs {name}"
             continue
         try:
-            with Progress() as bar:
-                job = bar.add_task("gathering", visible=False)
+            with reported("gathering") as report:
                 make_table(
                     sweep.root,
                     entry,
                     sweep.seeds[0],
                     workers=sweep.workers,
                     accept_failed=sweep.accept_failed,
-                    report=lambda done, rounds, bar=bar, job=job: bar.update(
-                        job, completed=done, total=rounds, visible=True
-                    ),
+                    report=report,
                 )
         except ValueError as error:
             progress.failed[entry.name] = str(error)

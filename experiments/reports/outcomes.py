@@ -9,7 +9,6 @@ Axis letters: E evaluations.
 """
 
 import dataclasses
-import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,8 +21,9 @@ import numpy as np
 import envs
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
+from dreamer_jax.schema import EVALUATION_ROW, check_shape
 from experiments.reports import statistics
-from experiments.runs.folder import folders, run_folders
+from experiments.runs.folder import folders, run_folders, sound
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.thesis.grid import Backend, Cell, Figure, Metric, Table, shown
 
@@ -99,6 +99,8 @@ def read_run(folder: str | Path) -> Run:
     by_member: list[list[Mapping[str, Any]]] = [[] for _ in spec.members]
     try:
         for row in rows:
+            if row["kind"] == "evaluation":
+                check_shape(row, EVALUATION_ROW, folder / "metrics.jsonl")
             by_member[row["member"]].append(row)
         outcomes = tuple(_outcome(spec, chosen) for chosen in by_member)
     except (KeyError, IndexError, TypeError) as error:
@@ -115,12 +117,9 @@ def _outcome(spec: RunSpec, rows: Iterable[Mapping[str, Any]]) -> Outcome:
     found: dict[int, dict[str, float]] = {}
     failed_at = None
     for row in rows:
-        evaluation = row["kind"] == "evaluation"
-        # Rows of evaluations did not always say whether the member is healthy.
-        sound = row.get("healthy", True) and not (evaluation and not math.isfinite(row["return"]))
-        if not sound and failed_at is None:
+        if not sound(row) and failed_at is None:
             failed_at = row["env_steps"]
-        if evaluation:
+        if row["kind"] == "evaluation":
             found.setdefault(row["env_steps"], {})[row["task"]] = row["return"]
     # A run that was killed may have evaluated some of its tasks only.
     whole = {steps: each for steps, each in sorted(found.items()) if len(each) == len(spec.tasks)}
@@ -150,7 +149,7 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
             outcomes[cell] = Outcome()
             continue
         one = run.outcomes[member]
-        by_title = {envs.spec(task).title: returns for task, returns in one.returns.items()}
+        by_title = {envs.described(task).title: returns for task, returns in one.returns.items()}
         outcomes[cell] = dataclasses.replace(one, returns=by_title)
     return outcomes
 

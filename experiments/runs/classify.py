@@ -6,7 +6,7 @@ Axis letters: K task, S samples, M latent feature size.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import envs
+from dreamer_jax.progress import Report, unreported
 from experiments.runs.agents import Source
 from experiments.runs.latents import Features, Latents, Policy, gather, phases_for
 from experiments.runs.text import aligned, titles
@@ -111,7 +112,7 @@ def classify(
     actors: Sequence[Source] = (),
     seed: int = 0,
     workers: int | None = None,
-    report: Callable[[], Any] = lambda: None,
+    report: Report = unreported,
 ) -> Outcome:
     """Fits a classifier on samples of known tasks, and tests it on others of all tasks.
 
@@ -123,9 +124,10 @@ def classify(
       thresholds: ξ; by default the thesis's, scaled to the agent's M.
       neighbours: votes.
       quantile: share of known samples that the suggested threshold should hold.
-      features, policy, workers, report: see `latents.gather`.
+      features, policy, workers: see `latents.gather`.
       actors: with the policy "trained", one agent for each task; by default the source.
       seed: of episodes, draws and posterior samples.
+      report: called after each phase; it counts those of all players.
 
     Raises:
       ValueError: see `check_request` and `latents.gather`.
@@ -141,8 +143,13 @@ def classify(
         policy=policy,
     )
     players = [(actor, (task,)) for actor, task in zip(actors, tasks, strict=False)]
+    players = players or [(source, tasks)]
     gathered: dict[str, Latents] = {}
-    for actor, played in players or [(source, tasks)]:
+    for number, (actor, played) in enumerate(players):
+
+        def of_all(done: int, phases: int, text: str, number: int = number) -> None:
+            report(number * phases + done, len(players) * phases, text)
+
         found = gather(
             source,
             played,
@@ -152,7 +159,7 @@ def classify(
             actor=actor,
             features=features,
             workers=workers,
-            report=report,
+            report=of_all,
         )
         gathered |= dict(zip(played, found, strict=True))
     drawn = {task: draw(latents, samples, seed) for task, latents in gathered.items()}

@@ -4,7 +4,6 @@ Axis letters: P population member, K task, T records of a phase, L frames of a p
 """
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 
 import envs
 from dreamer_jax.agent import Agent
+from dreamer_jax.progress import Report, unreported
 from dreamer_jax.randomness import EVALUATION_PHASES
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import Episode, collect, episodes
@@ -58,7 +58,7 @@ def evaluate(
     video: bool = False,
     workers: int | None = None,
     timeout: float = envs.SIMULATOR_TIMEOUT,
-    report: Callable[[int, float], Any] = lambda done, score: None,
+    report: Report = unreported,
 ) -> list[dict[str, Any]]:
     """Plays episodes with every member of a run: the mode, without noise, up to the first fall.
 
@@ -68,7 +68,7 @@ def evaluate(
       video: whether to write videos/evaluate_TASK.mp4 and videos/prediction_TASK.mp4.
       workers: simulator processes; by default one per core.
       timeout: seconds after which a simulator that does not answer is given up.
-      report: called after each episode with how many are done and their mean return.
+      report: called after each episode, with its mean return; it counts episodes.
 
     Returns:
       One row per member, task and episode: member, seed, label, task, episode, return, length,
@@ -82,7 +82,7 @@ def evaluate(
             records = _played(agent, env, agents, number)
             new = _rows(spec, records, number)
             rows += new
-            report(number + 1, float(np.mean([row["return"] for row in new])))
+            report(number + 1, count, f"return {np.mean([row['return'] for row in new]):.0f}")
             if video and number == 0:
                 write_videos(directory, spec, agent, params, records)
     finally:

@@ -1,8 +1,6 @@
 """A member of a run -> an exported agent: weights and a card, see `experiments.runs.exported`."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -11,6 +9,7 @@ import transfer
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json, write_json_atomically
 from dreamer_jax.logs import read_metrics
+from dreamer_jax.progress import Report, unreported
 from dreamer_jax.schedule import Schedule
 from experiments.runs.agents import check_sound, load_params
 from experiments.runs.evaluate import evaluate, load_agents
@@ -26,7 +25,7 @@ def export(
     episodes: int = 10,
     note: str = "",
     workers: int | None = None,
-    report: Callable[[int, float], Any] = lambda done, score: None,
+    report: Report = unreported,
 ) -> Card:
     """Writes one member of a run as weights and a card, after playing episodes with it.
 
@@ -37,7 +36,7 @@ def export(
       episodes: to play of each task, for the card.
       note: a sentence for the card.
       workers: simulator processes; by default one per core.
-      report: called after each episode with how many are done and their mean return.
+      report: called after each episode, with its mean return; it counts episodes.
 
     Raises:
       ValueError: the path ends otherwise; the folder holds no run, no checkpoint, no such member,

@@ -9,7 +9,9 @@ import contextlib
 import math
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import read_json
@@ -77,6 +79,12 @@ def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
     return found
 
 
+def sound(row: Mapping[str, Any]) -> bool:
+    """Whether a row of metrics shows a member that has not failed: losses, gradients and returns
+    are finite. Rows of evaluations did not always say so themselves."""
+    return row.get("healthy", True) and math.isfinite(row.get("return", 0.0))
+
+
 def failed_members(folder: str | Path) -> frozenset[int]:
     """The members of a run that met losses, gradients or returns that are not finite, by place.
 
@@ -84,11 +92,7 @@ def failed_members(folder: str | Path) -> frozenset[int]:
     """
     folder = Path(folder)
     rows = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
-    return frozenset(
-        row["member"]
-        for row in rows
-        if not (row.get("healthy", True) and math.isfinite(row.get("return", 0.0)))
-    )
+    return frozenset(row["member"] for row in rows if not sound(row))
 
 
 def latents_folder(root: str | Path, backend: str, seed: int) -> Path:

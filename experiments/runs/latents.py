@@ -9,8 +9,8 @@ Axis letters: K task, R records, M latent feature size, S samples.
 """
 
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 
 import envs
 from dreamer_jax.agent import Agent
+from dreamer_jax.progress import Report, unreported
 from dreamer_jax.randomness import LATENT_PHASES
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
@@ -87,7 +88,7 @@ def gather(
     actor: Source | None = None,
     features: Features = "sample",
     workers: int | None = None,
-    report: Callable[[], Any] = lambda: None,
+    report: Report = unreported,
 ) -> list[Latents]:
     """Plays phases of K tasks and infers the latent states of all their records.
 
@@ -100,7 +101,7 @@ def gather(
       actor: the trained agent that acts; by default the source.
       features: see `infer`.
       workers: simulator processes; by default one per core.
-      report: called after each phase.
+      report: called after each phase; it counts phases.
 
     Returns:
       Latent states, one entry per task, phase after phase with as many in each.
@@ -134,7 +135,7 @@ def gather(
                 ticks=source.spec.config.schedule.phase_ticks,
                 mode="random" if policy == "random" else "evaluate",
             )
-            records = to_host(records).map(lambda x: x[0])
+            records = to_host(records).at(0)
             env.check()
             missing = agent.action_size - acting.action_size
             action = np.pad(records.action, ((0, 0), (0, 0), (0, missing)))
@@ -146,7 +147,7 @@ def gather(
                 # Numbers of episodes go on from phase to phase.
                 before = found[k][-1].episodes[-1] if found[k] else 0
                 found[k].append(Latents(np.asarray(inferred), before + np.cumsum(one.first)))
-            report()
+            report(phase + 1, phases, "")
     finally:
         env.close()
     return [Latents(*(np.concatenate(x) for x in zip(*parts, strict=True))) for parts in found]

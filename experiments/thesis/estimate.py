@@ -8,8 +8,9 @@ Axis letters: P population member, K task, T ticks in a phase, A action.
 
 import dataclasses
 import functools
+import itertools
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -21,15 +22,25 @@ from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.progress import Report, unreported
 from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
 from experiments.runs.spec import RunSpec, action_size
 from experiments.runs.text import aligned
+from experiments.thesis import flops
 from experiments.thesis.graph import PlannedRun
 
+SAMPLE_OPERATIONS = 1e11
+"""An update that does no more than this is measured as it is."""
+
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
+SLACK = 1.5
+"""How much longer a run may take than what is counted of it."""
+NAME_COLUMNS = 30
+DUE = ("missing", "cut")
+"""States of the runs that still take time."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +48,8 @@ class Speed:
     """What was measured.
 
     Attributes:
-      update_seconds: one update of one member.
+      update_seconds: one update of one member, half of those measured taking less.
+      update_range: seconds that a tenth of the measured updates took less than, and a tenth more.
       update_bytes: memory that it takes beside the member's state and batch.
       policy_seconds: choosing one action for one member.
       tick_seconds: one tick of one simulator, by name of task.
@@ -48,6 +60,7 @@ class Speed:
     """
 
     update_seconds: float
+    update_range: tuple[float, float]
     update_bytes: int
     policy_seconds: float
     tick_seconds: Mapping[str, float]
@@ -71,68 +84,136 @@ class Estimate:
     disk: int
 
 
-def _batch(agent: Agent, members: int) -> Records:
-    """Records of the sizes of a batch, leaves [P, B, L, ...]."""
+def _shapes(agent: Agent, members: int) -> Records:
+    """A batch's shapes and dtypes, leaves [P, B, L, ...]."""
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (members, learning.batch_size, learning.sequence_length)
-    random = np.random.default_rng(0)
     return Records(
-        image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
-        action=np.zeros((*shape, agent.action_size), np.float32),
-        reward=np.zeros(shape, np.float32),
-        first=np.zeros(shape, bool),
-        terminal=np.zeros(shape, bool),
+        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
+        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
+        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
+        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
+        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
     )
+
+
+def _batch(agent: Agent, members: int) -> Records:
+    """Records of the sizes of a batch, leaves [P, B, L, ...]."""
+    random, shapes = np.random.default_rng(0), _shapes(agent, members)
+    batch = Records(*(np.zeros(x.shape, x.dtype) for x in shapes))
+    return batch._replace(image=random.integers(0, 256, batch.image.shape, dtype=np.uint8))
+
+
+def _made_up_state(agent: Agent):
+    """A state of one member, leaves [1, ...], without compiling what makes real ones."""
+    shapes = jax.eval_shape(
+        functools.partial(init_members, agent), jax.ShapeDtypeStruct((1,), jnp.int32)
+    )
+    random = np.random.default_rng(0)
+
+    def make(leaf):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jnp.broadcast_to(jax.random.key(0), leaf.shape)
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jnp.asarray(random.normal(0, 0.03, leaf.shape), leaf.dtype)
+        return jnp.ones(leaf.shape, leaf.dtype)
+
+    state = jax.tree.map(make, shapes)
+    optimisers = jax.tree.map(jnp.zeros_like, state.optimisers)
+    return dataclasses.replace(state, optimisers=optimisers)
 
 
 @functools.cache
 def _compiled_update(agent: Agent):
     """One member's update, compiled, with what it is called on."""
-    learning = agent.config.learning
-    state = init_members(agent, jnp.zeros(1, jnp.int32))
+    learning, state = agent.config.learning, _made_up_state(agent)
     sums = zero_sums(agent, state, learning.batch_size, learning.sequence_length)
     batch = _batch(agent, 1)
     lowered = update_members.lower(agent, state, sums, batch, mapping="auto", chunk=1)
     return lowered.compile(), state, sums, batch
 
 
-def measure(specs: Iterable[RunSpec], tell: Callable[[str], None] = lambda what: None) -> Speed:
+def sample_of(agent: Agent) -> tuple[Agent, float]:
+    """An agent with smaller batches, whose update can be measured in seconds and little memory.
+
+    Returns:
+      The agent, the same networks with a part of the sequences and of their length; and how many
+      times the arithmetic of its update the given agent's is. The agent itself and 1, where its
+      update is small.
+    """
+    whole = _operations(agent)
+    if whole <= SAMPLE_OPERATIONS:
+        return agent, 1.0
+    learning = agent.config.learning
+    batch, length = (max(1, n // 4) for n in (learning.batch_size, learning.sequence_length))
+    starts = learning.imagination_starts
+    if starts is not None:
+        starts = max(1, starts * batch * length // (learning.batch_size * learning.sequence_length))
+    learning = dataclasses.replace(
+        learning, batch_size=batch, sequence_length=length, imagination_starts=starts
+    )
+    config = dataclasses.replace(agent.config, learning=learning)
+    part = dataclasses.replace(agent, config=config)
+    return part, whole / _operations(part)
+
+
+def _operations(agent: Agent) -> float:
+    """Of one member's update."""
+    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), _shapes(agent, 1))
+    return flops.count(agent.update, state, batch)
+
+
+def _scaled_bytes(agent: Agent, part: Agent, temporary: int) -> int:
+    """Memory of an update from that of one on smaller batches: gradients do not grow with them."""
+    records = [
+        x.config.learning.batch_size * x.config.learning.sequence_length for x in (agent, part)
+    ]
+    fixed = min(temporary, _member_bytes(agent))
+    return int(fixed + (temporary - fixed) * records[0] / records[1])
+
+
+def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     """Measures the updates and the simulators of runs of one preset.
 
-    A plain agent of the largest action size stands for all of them. Nearly all of the time goes to
-    compilation, half a minute or so for each thing to be measured.
+    A plain agent of the largest action size stands for all of them. An update that is large is
+    measured on smaller batches, and multiplied by how much more arithmetic it does (see
+    `sample_of`). Nearly all of the time goes to compilation.
 
     Args:
       specs: the runs.
-      tell: is told what is measured next.
+      report: called before each measurement with what it is of; it counts those begun.
     """
     specs = tuple(specs)
     tasks = tuple(dict.fromkeys(task for spec in specs for task in spec.tasks))
     things = len(tasks) + 1
     widest = max(tasks, key=lambda task: envs.spec(task).action_size)
     agent = make_agent(RunSpec((widest,), (0,), specs[0].config))
-    tell(f"[1/{things}] an update and a policy")
+    report(1, things, "an update and a policy")
     started = time.perf_counter()
-    update, state, sums, batch = _compiled_update(agent)
-    policy_seconds = _policy_seconds(agent, state.params)
+    part, times = sample_of(agent)
+    update, state, sums, batch = _compiled_update(part)
+    policy_seconds = _policy_seconds(part, state.params)
     compile_seconds = time.perf_counter() - started
-    update_bytes = update.memory_analysis().temp_size_in_bytes
+    update_bytes = _scaled_bytes(agent, part, update.memory_analysis().temp_size_in_bytes)
     # The state is donated: a copy of it is.
     state = jax.tree.map(jnp.copy, state)
     state, sums, loss = update(state, jax.tree.map(jnp.copy, sums), batch)
     loss.block_until_ready()
-    updates, started = 0, time.perf_counter()
-    while time.perf_counter() - started < UPDATE_SECONDS:
+    took: list[float] = []
+    while sum(took) < times * UPDATE_SECONDS:
+        started = time.perf_counter()
         state, sums, loss = update(state, sums, batch)
         loss.block_until_ready()
-        updates += 1
-    update_seconds = (time.perf_counter() - started) / updates
+        took.append(times * (time.perf_counter() - started))
+    fast, middle, slow = np.quantile(took, [0.1, 0.5, 0.9]).tolist()
     ticks = {}
     for number, task in enumerate(tasks, start=2):
-        tell(f"[{number}/{things}] {task}")
+        report(number, things, task)
         ticks[task] = _tick_seconds(task, agent.config)
     return Speed(
-        update_seconds=update_seconds,
+        update_seconds=middle,
+        update_range=(fast, slow),
         update_bytes=update_bytes,
         policy_seconds=policy_seconds,
         tick_seconds={task: each for task, (each, _) in ticks.items()},
@@ -275,44 +356,77 @@ def in_memory(spec: RunSpec) -> RunSpec:
     return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
 
 
+def together(runs: Sequence[PlannedRun], speed: Speed | None) -> Estimate:
+    """What all runs still take: time and disk add up, of memory the largest counts.
+
+    Args:
+      runs: from `graph.plan_runs`; they come one after another.
+      speed: from `measure`; not needed if nothing is missing.
+    """
+    each = [estimate(run, speed) for run in runs if run.state in DUE]
+    return Estimate(
+        sum(one.seconds for one in each),
+        max((one.memory for one in each), default=0),
+        sum(one.disk for one in each),
+    )
+
+
 def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
     """The graph as a table: a row for each run, which names those it needs by number, and totals.
 
-    Time and disk add up; of memory the largest counts, for runs come one after another.
+    At most 100 columns wide: names that are longer go on in further lines.
 
     Args:
       runs: from `graph.plan_runs`.
       speed: from `measure`; not needed if nothing is missing.
     """
-    rows, total = [], Estimate(0.0, 0, 0)
+    rows = []
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
-        state += f", {len(run.failed)} failed" if run.failed else ""
-        tasks = "-" if run.spec is None else " + ".join(run.spec.tasks)
-        needs = ", ".join(numbers.get(name, name) for name in run.needs) or "-"
-        row = [f"{numbers[run.name]:>2}  {run.name}", str(len(run.cells)), tasks, needs, state]
-        if run.state in ("missing", "cut"):
-            one = estimate(run, speed)
-            row += [_duration(one.seconds), _size(one.memory), _size(one.disk)]
-            total = Estimate(
-                total.seconds + one.seconds, max(total.memory, one.memory), total.disk + one.disk
-            )
-        rows.append(row + ["-"] * (8 - len(row)))
+        needs = ",".join(numbers.get(name, "?") for name in run.needs) or "-"
+        first, *more = _lines(run.name)
+        row = [f"{numbers[run.name]:>2}  {first}", str(len(run.cells)), needs, state]
+        if run.state in DUE:
+            row += _in_words(estimate(run, speed), speed)
+        rows.append(row + ["-"] * (7 - len(row)))
+        told = [f"{len(run.failed)} failed"] if run.failed else []
+        for line, word in itertools.zip_longest(more, told, fillvalue=""):
+            rows.append([f"      {line}", "", "", word, "", "", ""])
     agents = str(sum(len(run.cells) for run in runs))
-    rows.append(
-        ["    together", agents, "", "", "", _duration(total.seconds), _size(total.memory)]
-        + [_size(total.disk)]
-    )
-    header = ["run", "agents", "tasks", "needs", "state", "time", "memory", "disk"]
-    return aligned(header, rows)
+    total = ["-"] * 3 if speed is None else _in_words(together(runs, speed), speed)
+    rows.append(["    together", agents, "", "", *total])
+    return aligned(["run", "agents", "needs", "state", "time", "memory", "disk"], rows)
 
 
-def _duration(seconds: float) -> str:
+def _lines(name: str) -> list[str]:
+    """A name in lines of at most so many letters as fit, broken after - and + where it can be."""
+    lines, rest = [], name
+    while len(rest) > NAME_COLUMNS:
+        place = max(rest.rfind(sign, 0, NAME_COLUMNS) for sign in "-+") + 1 or NAME_COLUMNS
+        lines.append(rest[:place])
+        rest = rest[place:]
+    return [*lines, rest]
+
+
+def _in_words(one: Estimate, speed: Speed) -> list[str]:
+    """Time as a range, memory and disk."""
+    return [span(one.seconds, speed), _size(one.memory), _size(one.disk)]
+
+
+def span(seconds: float, speed: Speed) -> str:
+    """A time as a range, such as "2.1 to 4.5 h".
+
+    From what it takes if all updates are as fast as the fastest tenth of those measured, to what it
+    takes if all are as slow as the slowest tenth and as much again as SLACK goes to what is not
+    counted: evaluations' videos, checkpoints, and whatever else the machine does.
+    """
+    fast, slow = (each / speed.update_seconds for each in speed.update_range)
+    low, high = seconds * fast, seconds * slow * SLACK
     for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:,.1f} {unit}"
-    return f"{seconds:.0f} s"
+        if high >= 2 * length:
+            return f"{low / length:,.1f} to {high / length:,.1f} {unit}"
+    return f"{low:.0f} to {high:.0f} s"
 
 
 def _size(count: int) -> str:

@@ -7,7 +7,6 @@ accuracies and a picture.
 Axis letters: S samples, M latent feature size.
 """
 
-import itertools
 import os
 import zipfile
 from collections.abc import Callable, Mapping
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from dreamer_jax.files import write_json_atomically
+from dreamer_jax.progress import Report, unreported
 from experiments.runs import classify
 from experiments.runs.agents import load_source
 from experiments.runs.folder import folders, latents_folder
@@ -38,7 +38,7 @@ def make_table(
     workers: int | None = None,
     accept_failed: bool = False,
     say: Callable[[str], Any] = print,
-    report: Callable[[int, int], Any] = lambda done, rounds: None,
+    report: Report = unreported,
 ) -> Path:
     """Tells the tasks of a table's latent states; gathers them first if nobody has.
 
@@ -49,7 +49,7 @@ def make_table(
       workers: simulator processes; by default one per core.
       accept_failed: take an agent whose losses were not finite any more, as it was before.
       say: where messages go.
-      report: called after each round of gathering, with how many are done and how many there are.
+      report: called after each round of gathering; it counts them.
 
     Returns:
       The file of accuracies, which `reports.outcomes.read_classification` reads.
@@ -85,22 +85,15 @@ def _gather(
     seed: int,
     workers: int | None,
     accept_failed: bool,
-    report: Callable[[int, int], Any],
+    report: Report,
 ) -> dict[str, tuple[Latents, Latents]]:
     cell = multitask(backend, AUTOENCODER, seed)
     places = folders(root)
     if cell.name not in places:
         raise ValueError(f"the agent {cell.name!r} is not trained yet: its table trains it first")
     source = load_source(*places[cell.name], accept_failed=accept_failed)
-    rounds, done = classify.rounds(source, SAMPLES), itertools.count(1)
-    found = gather(
-        source,
-        tasks,
-        rounds,
-        seed=seed,
-        workers=workers,
-        report=lambda: report(next(done), rounds),
-    )
+    rounds = classify.rounds(source, SAMPLES)
+    found = gather(source, tasks, rounds, seed=seed, workers=workers, report=report)
     return {
         task: classify.draw(latents, SAMPLES, seed)
         for task, latents in zip(tasks, found, strict=True)
