@@ -37,22 +37,26 @@ $(STAMP)%: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 comma := ,
 
+# Runs what comes after it. Ctrl-C that ended in a saved run (130) is no error: with the trap, the
+# shell lives to see it.
+STOPPABLE = trap : INT; run() { echo "$$*"; "$$@" || { code=$$?; test $$code = 130 || exit $$code; }; }; run
+
 setup: $(STAMP)bullet+brax+gymnasium+dev  ## Set up .venv with everything
 
 demo: $(STAMP)bullet  ## Train a source, transfer it to eight targets, show what came of it (15 minutes)
-	$(RUN) -m experiments demo --results $(RESULTS) $(ARGS)
+	@$(STOPPABLE) $(RUN) -m experiments demo --results $(RESULTS) $(ARGS)
 
 table-%: $(STAMP)$(BACKEND)  ## Make Table N of the thesis from our runs: train what is missing, resume, show
-	$(RUN) -m experiments table $* $(GRID) $(ARGS)
+	@$(STOPPABLE) $(RUN) -m experiments table $* $(GRID) $(ARGS)
 
 figure-%: $(STAMP)$(BACKEND)  ## Make Figure N of the thesis in the same way
-	$(RUN) -m experiments figure $* $(GRID) $(ARGS)
+	@$(STOPPABLE) $(RUN) -m experiments figure $* $(GRID) $(ARGS)
 
 tables: $(STAMP)$(BACKEND)  ## Make all tables
-	$(RUN) -m experiments table all $(GRID) $(ARGS)
+	@$(STOPPABLE) $(RUN) -m experiments table all $(GRID) $(ARGS)
 
 figures: $(STAMP)$(BACKEND)  ## Make all figures
-	$(RUN) -m experiments figure all $(GRID) $(ARGS)
+	@$(STOPPABLE) $(RUN) -m experiments figure all $(GRID) $(ARGS)
 
 plan: $(STAMP)$(BACKEND)  ## Show the runs behind TABLE and FIGURE (numbers, or all) and what they will take
 	$(RUN) -m experiments plan $(if $(TABLE),--table $(TABLE)) $(if $(FIGURE),--figure $(FIGURE)) $(GRID) $(ARGS)
@@ -77,11 +81,11 @@ docs: $(STAMP)docs  ## Build the pages and the reference of modules into site/
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
 
 train: $(STAMP)bullet+brax+gymnasium  ## Train on TASK with SEEDS and PRESET into OUT (resumes what is there)
-	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --out $(OUT) --resume $(ARGS)
+	@$(STOPPABLE) $(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --out $(OUT) --resume $(ARGS)
 
 sweep: $(STAMP)bullet+brax+gymnasium  ## Transfer SOURCE to TASK: every OMEGA and seed of SEEDS, and a baseline
 	@test -n "$(SOURCE)" || { echo 'error: name the source: make sweep TASK=bullet/hopper SOURCE=runs/source' >&2; exit 2; }
-	$(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --source $(SOURCE) \
+	@$(STOPPABLE) $(RUN) -m experiments train --task $(TASK) --seeds $(SEEDS) --preset $(PRESET) --source $(SOURCE) \
 	  --omega $(OMEGA) --baseline --out $(OUT)-sweep --resume $(ARGS)
 
 evaluate: $(STAMP)bullet+brax+gymnasium  ## Play 5 episodes with every agent in OUT, with videos

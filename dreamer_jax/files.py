@@ -43,10 +43,10 @@ def sync_folder(folder: str | os.PathLike) -> None:
 
 def read_json(path: str | os.PathLike) -> Any:
     """The value in a JSON file; `ValueError` naming the file if it is not JSON."""
-    text = Path(path).read_text(encoding="utf-8")
+    content = Path(path).read_bytes()
     try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
+        return json.loads(content.decode("utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not valid JSON ({error}); delete it or restore it") from error
 
 

@@ -149,8 +149,21 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
             row = json.loads(line)
         except ValueError as error:
             raise ValueError(f"line {number} of {path} is not JSON: {line[:80]!r}") from error
-        rows.append({name: _parsed(value) for name, value in row.items()})
+        rows.append(row)
+    for number, row in enumerate(rows, start=1):
+        if not isinstance(row, dict) or (path.name == "metrics.jsonl" and not _is_row(row)):
+            raise DamagedError(
+                f"line {number} of {path} lacks kind, member or env_steps, or they are not what "
+                f"this program writes: {row!r:.80}"
+            )
+    rows = [{name: _parsed(value) for name, value in row.items()} for row in rows]
     return rows
+
+
+def _is_row(row: Mapping[str, Any]) -> bool:
+    """Whether a row has what all rows of metrics have (see `dreamer_jax.schema.METRICS_ROW`)."""
+    numbers = (row.get("member"), row.get("env_steps"))
+    return isinstance(row.get("kind"), str) and all(type(x) is int and x >= 0 for x in numbers)
 
 
 def _parsed(value: Any) -> Any:

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dreamer_jax import schema
 from dreamer_jax.files import explained
 from dreamer_jax.holes import free_beginning
 from dreamer_jax.integrity import (
@@ -37,6 +38,7 @@ from dreamer_jax.integrity import (
 from dreamer_jax.prefetch import Prefetcher
 from dreamer_jax.records import Records
 from dreamer_jax.sampling import sample_indices
+from dreamer_jax.schema import check_shape
 from dreamer_jax.stream_checksums import StreamChecksums
 
 _HEADER = "replay.json"
@@ -115,7 +117,7 @@ class Replay:
         header = self.directory / _HEADER
         expected = {"format": _FORMAT, **layout}
         if header.exists():
-            stored = read_sealed_json(header)
+            stored = check_shape(read_sealed_json(header), {"*": object}, header)
             differences = [
                 f"{name} {stored.get(name)} (expected {value})"
                 for name, value in expected.items()
@@ -174,7 +176,12 @@ class Replay:
         path = self.directory / _DELETED
         if not path.exists():
             return np.zeros_like(self._lengths)
-        return np.array(read_sealed_json(path)["deleted"], np.int64)
+        stored = check_shape(read_sealed_json(path), schema.DELETED, path)["deleted"]
+        if np.shape(stored) != self._lengths.shape:
+            raise DamagedError(
+                f"{path} names {np.shape(stored)} streams, not {self._lengths.shape}"
+            )
+        return np.array(stored, np.int64)
 
     def _set_deleted(self, deleted: np.ndarray) -> None:
         if (deleted != self._deleted).any():

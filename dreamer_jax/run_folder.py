@@ -17,6 +17,7 @@ from dreamer_jax.integrity import DamagedError
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.logs import MetricsWriter
 from dreamer_jax.replay import Replay
+from dreamer_jax.schema import METADATA, check_shape
 
 
 class RunFolder:
@@ -80,6 +81,7 @@ class RunFolder:
                 )
             return None
         tree, metadata, found = self.checkpoints.restore(template, step)
+        check_shape(metadata, METADATA, self.checkpoints.path(found) / "metadata.json")
         checksums = metadata.get("checksums", {})
         lengths = np.asarray(metadata["replay"])
         try:

@@ -22,6 +22,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from dreamer_jax.files import read_json, write_json_atomically
+from dreamer_jax.integrity import DamagedError
+from dreamer_jax.schema import LEAVES, check_shape
 
 Tree = TypeVar("Tree")
 _FORMAT = 1
@@ -176,11 +178,15 @@ def _read_values(
 
 def _read_table(folder: Path) -> list[dict[str, Any]]:
     table = read_part(folder, "leaves.json")
-    if table.get("format") != _FORMAT:
+    if isinstance(table, dict) and table.get("format", _FORMAT) != _FORMAT:
         raise ValueError(
             f"{folder} has format {table.get('format')}, this version reads {_FORMAT}; "
             "use the version that wrote it"
         )
+    try:
+        check_shape(table, LEAVES, folder / "leaves.json")
+    except DamagedError as error:
+        raise CorruptCheckpointError(str(error)) from error
     shapes = ("path", "shape", "stored_shape")
     return [row | {name: tuple(row[name]) for name in shapes} for row in table["leaves"]]
 

@@ -17,6 +17,7 @@ from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from dreamer_jax.integrity import DamagedError, file_checksum, is_sealed, read_sealed_json
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.replay import Replay
+from dreamer_jax.schema import METADATA, REPLAY, check_shape
 
 
 class Finding(NamedTuple):
@@ -56,8 +57,9 @@ def _checkpoints(checkpoints: Checkpointer) -> tuple[list[Finding], list[dict]]:
         name = f"checkpoint {step}"
         try:
             sealed = checkpoints.check(step)
-            committed.append(checkpoints.metadata(step))
-        except (CorruptCheckpointError, OSError) as error:
+            path = checkpoints.path(step) / "metadata.json"
+            committed.append(check_shape(checkpoints.metadata(step), METADATA, path))
+        except (CorruptCheckpointError, DamagedError, OSError) as error:
             findings.append(Finding(name, "damaged", str(error)))
             continue
         files = sum(path.is_file() for path in checkpoints.path(step).rglob("*"))
@@ -91,7 +93,7 @@ def _replay(directory: Path, committed: list[dict]) -> Iterable[Finding]:
     for name in ("replay.json", "deleted.json"):
         if (folder / name).exists():
             yield sealed_file(folder, name)
-    layout = read_sealed_json(folder / "replay.json")
+    layout = check_shape(read_sealed_json(folder / "replay.json"), REPLAY, folder / "replay.json")
     layout.pop("format", None)
     replay = Replay(folder, **layout)
     if committed:

@@ -7,7 +7,15 @@ too.
 
 from envs.base import Env, SimulatorError, TaskSpec, TimeStep
 from envs.pool import SIMULATOR_TIMEOUT
-from envs.registry import make, register_gymnasium, spec, specs, task_names
+from envs.registry import (
+    described,
+    make,
+    names_module,
+    register_gymnasium,
+    spec,
+    specs,
+    task_names,
+)
 
 __all__ = [
     "SIMULATOR_TIMEOUT",
@@ -15,7 +23,9 @@ __all__ = [
     "SimulatorError",
     "TaskSpec",
     "TimeStep",
+    "described",
     "make",
+    "names_module",
     "spec",
     "specs",
     "task_names",

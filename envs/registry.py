@@ -130,11 +130,34 @@ def spec(name: str) -> TaskSpec:
             has no images or no fitting actions.
         ModuleNotFoundError: if a gymnasium environment needs a package that is not installed.
     """
+    task = described(name)
+    return gymnasium_task(task.title) if is_gymnasium(name) else task
+
+
+def is_gymnasium(name: str) -> bool:
+    """Whether a name is `gymnasium/ID`."""
+    backend, _, id = name.partition("/")
+    return backend == "gymnasium" and bool(id)
+
+
+def names_module(name: str) -> bool:
+    """Whether a task can only be made by importing a module that its name names."""
+    return is_gymnasium(name) and ":" in name
+
+
+def described(name: str) -> TaskSpec:
+    """What a task's name alone tells: no environment is made, no module imported.
+
+    Of a gymnasium environment that is its title; its other attributes mean nothing.
+
+    Raises:
+        ValueError: if there is no such task, with those there are.
+    """
     if name in _TASKS:
         return _TASKS[name]
     backend, _, id = name.partition("/")
-    if backend == "gymnasium" and id:
-        return gymnasium_task(id)
+    if is_gymnasium(name):
+        return TaskSpec(name=name, title=id, action_size=0, simulator="", gymnasium_id=id)
     if backend == "brax" and (task := _brax_choice(name)) is not None:
         return task
     near = difflib.get_close_matches(name, _TASKS)

@@ -6,6 +6,7 @@ is free of that.
 
 import importlib.util
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 _OWN = ("dreamer_jax", "envs", "transfer")
@@ -23,8 +24,15 @@ def hidden_packages() -> dict[str, str]:
     return found
 
 
-def main() -> int:
-    """Runs one command, unless something in the working folder hides a part of this program."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command, unless something in the working folder hides a part of this program.
+
+    Args:
+      arguments: by default those of this process.
+
+    Returns:
+      The exit code, see `experiments.cli.main`.
+    """
     if hidden := hidden_packages():
         names = ", ".join(f"{name} ({place})" for name, place in hidden.items())
         print(
@@ -33,9 +41,9 @@ def main() -> int:
             file=sys.stderr,
         )
         return 2
-    from experiments.cli.main import main
+    from experiments.cli import main as commands
 
-    return main()
+    return commands.main(arguments)
 
 
 if __name__ == "__main__":

@@ -216,3 +216,19 @@ def test_cells_are_named_in_the_order_of_the_members(tmp_path):
 def test_presets_of_the_grid_are_those_of_single_runs():
     run = plan(TABLES["table-3"], config=preset("thesis"))[-1]
     assert run.spec.config == preset("thesis")
+
+
+def test_methods_of_comparison_are_populations_of_their_own_from_the_same_sources():
+    table = dataclasses.replace(TABLES["table-3"], compared=grid.COMPARED)
+    cells = {cell.name: cell for cell in cells_of(table)}
+    *sources, targets, tuned, frozen = plan(table)
+    assert [len(run.cells) for run in (targets, tuned, frozen)] == [57, 9, 9]
+    assert [run.name for run in (tuned, frozen)] == [
+        "bullet-Hopper-fine-tuning", "bullet-Hopper-frozen-source",
+    ]  # fmt: skip
+    assert targets.needs == tuned.needs == frozen.needs == tuple(run.name for run in sources)
+    for run in (tuned, frozen):
+        for name, member in zip(run.cells, run.spec.members, strict=True):
+            assert member.seed == cells[name].seed
+            source = "bullet-" + "+".join(cells[name].source.tasks) + "-seed-0"
+            assert member.tags["source"] == source

@@ -1,5 +1,6 @@
 """The thesis's grid: how many agents each table and figure has, and what they need."""
 
+import dataclasses
 import itertools
 
 import pytest
@@ -80,3 +81,30 @@ def test_on_another_backend_no_agent_is_shared():
         for backend in ("bullet", "brax")
     )
     assert len(here) == len(there) and not here & there
+
+
+def test_methods_of_comparison_are_rows_where_they_were_asked_for_or_are_there():
+    table = TABLES["table-3"]
+    whole = dataclasses.replace(table, compared=grid.COMPARED)
+    # Two methods of three numbers of sources and three seeds.
+    assert set(shown(table)) < set(shown(whole)) and len(shown(whole)) == 57 + 18
+    assert grid.with_compared(table, ()) == table
+    (cell, *_) = grid.entries(whole)["Hopper", 2, "frozen-source"]
+    assert grid.with_compared(table, {cell.name}).compared == ("frozen-source",)
+    assert grid.with_compared(whole, ()) == whole
+    assert grid.with_compared(FIGURES["figure-12"], {cell.name}) == FIGURES["figure-12"]
+    meta = TABLES["table-16"]
+    assert grid.with_compared(meta, {cell.name}) == meta
+
+
+@pytest.mark.parametrize("name", ["table-3", "table-16"])
+def test_a_table_shows_the_cells_of_its_entries(name):
+    found = grid.entries(TABLES[name])
+    assert {cell for cells in found.values() for cell in cells} == set(shown(TABLES[name]))
+    for (target, count, omega), cells in found.items():
+        assert [cell.seed for cell in cells] == list(grid.SEEDS)
+        assert {cell.tasks for cell in cells} == {(target,)}
+        assert {cell.omega for cell in cells} == {omega}
+        for cell in cells:
+            sources = cell.reward_sources or (cell.source.tasks if cell.source else None)
+            assert (None if sources is None else len(sources)) == count

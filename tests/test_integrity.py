@@ -15,22 +15,27 @@ from dreamer_jax.integrity import (
     write_sealed_json,
 )
 from dreamer_jax.logs import MetricsWriter
+from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 from dreamer_jax.run_folder import RunFolder
 
 LAYOUT = {"members": 2, "tasks": 1, "image_size": 4, "action_size": 2}
 
 
+def counters(rounds):
+    return {"rounds": rounds, "updates": 0, "evaluations": 0, "averaged": 0}
+
+
 def phase(steps, seed):
     random = np.random.default_rng(seed)
     shape = (2, 1, steps)
-    return {
-        "image": random.integers(0, 256, (*shape, 4, 4, 3), dtype=np.uint8),
-        "action": random.normal(size=(*shape, 2)).astype(np.float32),
-        "reward": random.normal(size=shape).astype(np.float32),
-        "first": np.zeros(shape, bool),
-        "terminal": np.zeros(shape, bool),
-    }
+    return Records(
+        image=random.integers(0, 256, (*shape, 4, 4, 3), dtype=np.uint8),
+        action=random.normal(size=(*shape, 2)).astype(np.float32),
+        reward=random.normal(size=shape).astype(np.float32),
+        first=np.zeros(shape, bool),
+        terminal=np.zeros(shape, bool),
+    )
 
 
 def flip(path, place, bit=0):
@@ -50,16 +55,16 @@ def fill(directory, phases=3):
         folder.replay.append(phase(10, number))
         row = {"kind": "collect", "member": 0, "env_steps": 10 * number, "return": 0.5}
         folder.writer.write(row)
-        folder.save(number + 1, {"weights": np.full(50, number)}, {"rounds": number + 1})
+        folder.save(number + 1, {"weights": np.full(50, number)}, counters(number + 1))
     folder.close()
 
 
 def restore(directory, step=None):
     folder = open_folder(directory)
     try:
-        tree, counters = folder.restore({"weights": np.zeros(50, int)}, step)
+        tree, found = folder.restore({"weights": np.zeros(50, int)}, step)
         folder.replay.sample([0, 1], 0, 50, 3)
-        return tree, counters
+        return tree, found
     finally:
         folder.close()
 
@@ -138,13 +143,13 @@ def test_a_folder_of_an_earlier_version_goes_on_and_new_records_are_checked(tmp_
     values = json.loads(metadata.read_text())
     kept = {name: values[name] for name in ("counters", "replay", "metrics")}
     metadata.write_text(json.dumps(kept))
-    assert restore(tmp_path)[1] == {"rounds": 1}
+    assert restore(tmp_path)[1] == counters(1)
     folder = open_folder(tmp_path)
     folder.restore({"weights": np.zeros(50, int)})
     folder.replay.append(phase(10, 1))
-    folder.save(2, {"weights": np.zeros(50, int)}, {"rounds": 2})
+    folder.save(2, {"weights": np.zeros(50, int)}, counters(2))
     folder.close()
-    assert restore(tmp_path)[1] == {"rounds": 2}
+    assert restore(tmp_path)[1] == counters(2)
     flip(tmp_path / "replay" / "member_000" / "task_0.records", 62 * 12)
     with pytest.raises(DamagedError, match=r"records \[10, 20\)"):
         restore(tmp_path)
@@ -163,8 +168,8 @@ def test_a_damaged_newest_checkpoint_is_told_and_the_one_before_goes_on(tmp_path
     path = tmp_path / name
     flip(path, path.read_bytes().index(b"3"))
     with pytest.warns(UserWarning, match="step_000000000003 is damaged"):
-        _, counters = restore(tmp_path)
-    assert counters == {"rounds": 2}
+        _, found = restore(tmp_path)
+    assert found == counters(2)
 
 
 def test_checksums_that_are_gone_are_missed(tmp_path):
@@ -187,9 +192,9 @@ def test_a_changed_digit_of_the_metrics_is_told_with_the_older_checkpoints(tmp_p
     path.write_text("".join([*lines[:2], lines[2].replace("0.5", "0.6")]))
     with pytest.raises(DamagedError, match="metrics.jsonl is not what was.*--from-checkpoint 2$"):
         restore(tmp_path)
-    assert restore(tmp_path, step=2)[1] == {"rounds": 2}
+    assert restore(tmp_path, step=2)[1] == counters(2)
     # The later one is gone, so that nothing goes on from it by mistake.
-    assert restore(tmp_path)[1] == {"rounds": 2}
+    assert restore(tmp_path)[1] == counters(2)
 
 
 def test_records_without_a_checkpoint_are_not_thrown_away(tmp_path):

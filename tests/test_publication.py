@@ -7,9 +7,10 @@ import re
 import pytest
 
 from dreamer_jax.config import preset
-from experiments.reports import curves, figures, publication, sheet, summary
+from experiments.reports import curves, figures, findings, publication, sheet, summary
 from experiments.reports.classification import Classification, Share
 from experiments.reports.outcomes import read_outcomes
+from experiments.runs.folder import folders
 from experiments.thesis import grid
 from experiments.thesis.grid import FIGURES, TABLES
 from made_up_results import baselines, rising, targets, write_folder
@@ -59,6 +60,24 @@ def test_a_table_has_the_thesiss_form_with_both_values(root, tmp_path):
     assert rows[0][1:] == ["120 ± 12 | 847 ± 135", "not run | 779 ± 259", "not run | 838 ± 169"]
     assert rows[1][1] == "4 of 8 evaluations | 857 ± 145"
     assert rows[6][1:] == ["20 ± 12 | 723 ± 364"]
+
+
+def test_methods_of_comparison_have_rows_beside_the_baseline(root, tmp_path):
+    others = [grid.compared("bullet", TARGET, 2, "fine-tuning", seed, SEEDS[0]) for seed in SEEDS]
+    write_folder(root, "tuned", others, rising)
+    table = grid.with_compared(TABLES["table-7"], folders(root), SEEDS)
+    lines = publication.write_table(table, root, SEEDS, tmp_path / "out").splitlines()
+    rows = {row[0]: row[1:] for row in (re.split("  +", line) for line in lines[5:13])}
+    assert list(rows)[-2:] == ["Fine-tuning", "Baseline"]
+    assert rows["Fine-tuning"] == ["120 ± 12 | -", "not run | -", "not run | -"]
+    records = list(csv.DictReader((tmp_path / "out" / "table-7.csv").open(encoding="utf-8")))
+    (record,) = [one for one in records if one["method"] == "fine-tuning" and one["sources"] == "2"]
+    assert (record["omega"], record["difference"]) == ("", "100.0")
+    # What is told of fractional transfer is told of it alone.
+    outcomes = read_outcomes(root, grid.shown(table, SEEDS))
+    (finding,) = findings.findings([table], outcomes, SEEDS)
+    compared = [c.entry for group in finding.comparisons["overall"].values() for c in group]
+    assert {entry.method for entry in compared} == {None} and compared
 
 
 def test_a_table_is_written_as_text_csv_and_pictures(root, tmp_path):

@@ -7,6 +7,7 @@ two are read before the others, for they set their defaults. Nothing here import
 import argparse
 import dataclasses
 import functools
+import re
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,8 @@ from experiments.methods import Method
 
 Preset = Literal["thesis", "cpu", "demo", "debug"]
 DEFAULT_PRESET: Preset = "cpu"
+
+_NUMBER = re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 ConfigFile = Annotated[Path | None, tyro.conf.arg(name="config")]
 """The option --config."""
@@ -47,8 +50,7 @@ def read_base(arguments: Sequence[str]) -> Base:
     """Reads --preset and --config alone from a command's arguments.
 
     Raises:
-      ValueError: there is no such preset, or the file is no file of settings.
-      FileNotFoundError: there is no such file.
+      ValueError: there is no such preset, no such file, or it is no file of settings.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset", nargs="?")
@@ -67,15 +69,18 @@ def read_settings(path: Path) -> dict[str, Any]:
     """A file of settings: YAML or JSON, in the form of a run's own (run.json), or a part of it.
 
     Raises:
-      ValueError: it is no mapping, or holds what is no setting of a run.
-      FileNotFoundError: there is no such file.
+      ValueError: there is no such file, it is no mapping, or holds what is no setting of a run.
     """
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        """YAML of version 1.2 in one point: 1e-4 is a number."""
+
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file of settings {path}")
+        raise ValueError(f"there is no file of settings {path}")
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is neither YAML nor JSON: {error}") from error
     if isinstance(values, dict) and "spec" in values:  # a whole run.json

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import tyro
 
+from dreamer_jax.ranges import setting
 from experiments.cli.exits import UsageError, usage_errors
 from experiments.cli.options import DEFAULT_PRESET, Preset
 from experiments.cli.thesis import chosen
@@ -29,7 +30,7 @@ class Report:
     """The results folder, or several."""
     out: Path = Path("comparison.png")
     """Of several folders: the picture to draw; an .svg is written beside it."""
-    seeds: tuple[int, ...] = ()
+    seeds: tuple[int, ...] = setting((), 0, 2**31 - 1)
     """Of all results: the seeds that tables and figures show, the first one being that of the
     sources; by default all that there are."""
     backend: Backend = "bullet"
@@ -49,13 +50,13 @@ class Seeds:
     """Numbers of tables of returns (1 to 12, 16, 17)."""
     preset: Preset = DEFAULT_PRESET
     """Whose results."""
-    group: int = 5
+    group: int = setting(5, 1, 10_000)
     """Seeds between two looks."""
-    most: int = 20
+    most: int = setting(20, 1, 10_000)
     """Seeds at the last look."""
-    omegas: tuple[float, ...] = grid.OMEGAS
+    omegas: tuple[float, ...] = setting(grid.OMEGAS, 0, 1)
     """The fractions that are to be compared; the fewer, the fewer seeds they need."""
-    counts: tuple[int, ...] = grid.COUNTS
+    counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """The numbers of source tasks that are to be compared."""
     backend: Backend = "bullet"
     """The simulators."""
@@ -139,9 +140,10 @@ def _write(
 ) -> None:
     from experiments.reports import page, publication, tidy
     from experiments.reports.outcomes import read_runs
-    from experiments.runs.folder import report_folder
+    from experiments.runs.folder import folders, report_folder
 
-    folder = report_folder(root, backend)
+    folder, held = report_folder(root, backend), folders(root)
+    entries = [grid.with_compared(entry, held, seeds) for entry in entries]
     folder.mkdir(parents=True, exist_ok=True)
     for entry in entries:
         if isinstance(entry, Table):

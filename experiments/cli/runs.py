@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+import envs
 from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.ranges import setting
@@ -50,16 +51,18 @@ class Run:
     over the preset's, under those given by name."""
     resume: bool = False
     """Continue the run that the results folder holds."""
-    accept_failed: bool = False
-    """Transfer from agents whose losses were not finite any more, as they were before."""
     from_checkpoint: int | Literal["list"] | None = None
     """Continue it from an older checkpoint, named by its step; later ones are given up. `list`
     lists what there is."""
+    accept_failed: bool = False
+    """Transfer from agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
     and ended."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,8 @@ class Evaluate:
     """Simulator processes; by default one per core."""
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -175,6 +180,8 @@ class Classify:
     """Take agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +196,7 @@ def train(command: Train) -> int:
     """Trains a population."""
     from experiments.cli.reports import Report, report
     from experiments.runs.spec import RunSpec
+    from experiments.runs.trust import check_trust, is_of_another
 
     run = command.run
     if run.from_checkpoint == "list":
@@ -200,6 +208,10 @@ def train(command: Train) -> int:
     with usage_errors():
         method = make_method(command.method, command.transfer)
         spec = RunSpec(run.task, run.seeds, command.config, method)
+        envs.specs(spec.tasks)
+        check_trust([*method.sources, *method.stored], run.trust)
+        if is_of_another(run.out):
+            check_trust([run.out], run.trust)
     from dreamer_jax.host_memory import keep_freed_memory
     from experiments.runs.run import carry_out, make_run
 
@@ -235,9 +247,9 @@ def verify(command: Verify) -> int:
 def evaluate(command: Evaluate) -> int:
     """Plays episodes and prints their returns."""
     with usage_errors():
-        from experiments.runs.spec import read_spec
+        from experiments.runs.trust import check_trust
 
-        read_spec(command.directory)
+        check_trust([command.directory], command.trust)
         lock = FolderLock(command.directory, ".evaluation.lock")
     with lock:
         return _evaluate(command)
@@ -293,6 +305,7 @@ def classify(command: Classify) -> int:
     from dreamer_jax.progress import reported
     from experiments.runs import classify
     from experiments.runs.agents import load_source
+    from experiments.runs.trust import check_trust
 
     request = {
         "samples": command.samples,
@@ -302,6 +315,7 @@ def classify(command: Classify) -> int:
     }
     with usage_errors():
         classify.check_request(command.task, command.known, actors=command.actors, **request)
+        check_trust([command.source, *command.actors], command.trust)
         load = functools.partial(load_source, accept_failed=command.accept_failed)
         source = load(command.source, command.source_member)
         actors = [load(directory) for directory in command.actors]

@@ -31,6 +31,8 @@ class Export:
     """A sentence for the card."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    trust: bool = False
+    """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,10 @@ def export(command: Export) -> int:
     """Writes an agent and its card."""
     from dreamer_jax.progress import reported
     from experiments.runs.export import export
+    from experiments.runs.trust import check_trust
 
+    with usage_errors():
+        check_trust([command.directory], command.trust)
     with usage_errors(), reported("playing") as report:
         card = export(
             command.directory,

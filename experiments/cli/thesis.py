@@ -35,6 +35,9 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
+    compared: tuple[str, ...] = ()
+    """Other methods to train, too, from the same sources (any of fine-tuning, frozen-source), for
+    rows of their own in tables of fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
@@ -97,7 +100,8 @@ class Plan:
 def _sweep(base: Base) -> Sweep:
     """The defaults of a sweep."""
     if strange := sorted(set(base.values) - {"preset", "seeds", "config"}):
-        raise ValueError(f"{base.file}: the settings {', '.join(strange)} are those of a table")
+        told = ", ".join(strange)
+        raise ValueError(f"{base.file}: the settings {told} are not those of a table")
     seeds = sequence(base.values, "seeds", grid.SEEDS)
     return Sweep(preset=base.preset, file=base.file, seeds=seeds, config=base.config)
 
@@ -146,7 +150,7 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    return _make(entries, command.sweep)
+    return _make([_beside(entry, command.sweep) for entry in entries], command.sweep)
 
 
 def figures(command: Figures) -> int:
@@ -163,6 +167,13 @@ def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
     return dataclasses.replace(entry, omegas=omegas, counts=counts)
 
 
+def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
+    """A table of fractional transfer with the methods of comparison that are asked for."""
+    if isinstance(entry, Table) and entry.kind == "ftl":
+        return dataclasses.replace(entry, compared=sweep.compared)
+    return entry
+
+
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
     """The runs behind tables and figures."""
     from experiments.thesis.graph import plan_runs
@@ -176,6 +187,8 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
+        if not set(sweep.compared) <= set(grid.COMPARED):
+            raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
         entries = [_restricted(entry, sweep) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
         return plan_runs(cells, sweep.config, sweep.root)
@@ -204,11 +217,6 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     return runs, progress
 
 
-def _to_standard_error(done: int, total: int, text: str) -> None:
-    """A `Report` in lines, apart from what the command prints."""
-    print(f"  [{done}/{total}] {text}", file=sys.stderr, flush=True)
-
-
 def _tell_problems(progress) -> int:
     """Names what was not trained.
 
@@ -233,7 +241,7 @@ def plan(command: Plan) -> int:
             *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
             *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
         ]
-    runs = _planned(entries, sweep)
+    runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
     known = _speed(runs, again=command.measure)
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed))
@@ -260,15 +268,13 @@ def _speed(runs, again: bool = False):
     due = [run.spec for run in runs if run.state in DUE]
     if not due:
         return None
-    told: list[str] = []
 
-    def tell(what: str) -> None:
-        if not told:
+    def report(number: int, count: int, what: str) -> None:
+        if number == 1:
             print("measuring how fast this machine is:", file=sys.stderr)
-        told.append(what)
-        print(f"  {what}", file=sys.stderr, flush=True)
+        print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
 
-    return speed_of(due, cache_folder(), again=again, tell=tell)
+    return speed_of(due, cache_folder(), again=again, report=report)
 
 
 def _may_begin(runs) -> bool:

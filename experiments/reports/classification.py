@@ -61,7 +61,8 @@ def read_classification(
     try:
         found = read_json(path)
         rows = {
-            (row["threshold"], envs.spec(row["task"]).title): row for row in found["accuracies"]
+            (row["threshold"], envs.described(row["task"]).title): row
+            for row in found["accuracies"]
         }
         scaled = dict.fromkeys(row["threshold"] for row in found["accuracies"])
         shares = tuple(

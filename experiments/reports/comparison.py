@@ -71,7 +71,8 @@ class Entry:
     Attributes:
       target: title of the task.
       sources: number of source tasks; None for the baseline.
-      omega: the fraction of equation 19, if any.
+      variant: the fraction of equation 19, if any; or the name of the method, where it is not the
+        table's own.
       outcomes: of each seed.
       seeds: of the outcomes.
       published: the thesis's entry, if it has one.
@@ -84,7 +85,7 @@ class Entry:
 
     target: str
     sources: int | None
-    omega: float | None
+    variant: float | str | None
     outcomes: tuple[Outcome, ...]
     seeds: tuple[int, ...]
     published: Published | None
@@ -123,7 +124,21 @@ class Entry:
     def name(self) -> str:
         """Which entry of its table it is."""
         words = ["baseline"] if self.sources is None else [f"{self.sources} tasks"]
-        return ", ".join(words + ([] if self.omega is None else [f"ω = {self.omega:g}"]))
+        if self.method is not None:
+            words.append(self.method)
+        elif self.omega is not None:
+            words.append(f"ω = {self.omega:g}")
+        return ", ".join(words)
+
+    @property
+    def omega(self) -> float | None:
+        """The fraction, if any."""
+        return None if isinstance(self.variant, str) else self.variant
+
+    @property
+    def method(self) -> str | None:
+        """The name of the method, where it is not the table's own."""
+        return self.variant if isinstance(self.variant, str) else None
 
     @property
     def full_name(self) -> str:
@@ -139,27 +154,6 @@ class Entry:
         return tuple(seed for seed, outcome in pairs if outcome.state == state)
 
 
-def keys(table: Table) -> list[tuple[str, int | None, float | None]]:
-    """Target, sources and fraction of each entry, a target's baseline first."""
-    omegas = table.omegas if table.kind == "ftl" else (None,)
-    found = []
-    for target in table.targets:
-        found.append((target, None, None))
-        found += [(target, count, omega) for omega in omegas for count in table.counts]
-    return found
-
-
-def cells(table: Table, key: tuple, seeds: Sequence[int]) -> tuple[Cell, ...]:
-    """The cells of an entry, one per seed; see `keys`."""
-    target, count, omega = key
-    backend, source = table.backend, seeds[0]
-    if count is None:
-        return tuple(grid.baseline(backend, target, seed) for seed in seeds)
-    if table.kind == "meta":
-        return tuple(grid.meta(backend, target, count, seed, source) for seed in seeds)
-    return tuple(grid.fractional(backend, target, count, omega, seed, source) for seed in seeds)
-
-
 def compare(
     table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
 ) -> dict[tuple, Entry]:
@@ -171,8 +165,8 @@ def compare(
       seeds: of targets and baselines; the first one is the sources'.
     """
     entries: dict[tuple, Entry] = {}
-    for key in keys(table):
-        group = tuple(outcomes[cell] for cell in cells(table, key, seeds))
+    for key, cells in grid.entries(table, seeds).items():
+        group = tuple(outcomes[cell] for cell in cells)
         base = entries.get((key[0], None, None))
         entries[key] = _entry(table, key, group, tuple(seeds), base)
     return _with_verdicts(entries)
@@ -182,9 +176,9 @@ def transferred(table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[
     """Whether anything of a table of returns but its agents from scratch has begun."""
     return any(
         outcomes[cell].state != "missing"
-        for key in keys(table)
-        if key[1] is not None
-        for cell in cells(table, key, seeds)
+        for (_, count, _), cells in grid.entries(table, seeds).items()
+        if count is not None
+        for cell in cells
     )
 
 
@@ -284,6 +278,8 @@ def across_targets(
     by_target: dict[str, dict[tuple, Entry]] = {}
     for entries in tables:
         for (target, *setting), entry in entries.items():
+            if entry.method is not None:
+                continue  # not of the table's own method
             by_target.setdefault(target, {})[tuple(setting)] = entry
     by_target = {
         target: group

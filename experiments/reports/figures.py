@@ -53,37 +53,18 @@ class Panel:
 
 def panels(figure: Figure, seeds: Sequence[int]) -> tuple[Panel, ...]:
     """What a figure of learning curves shows: one panel per fraction, number of sources or task."""
-    backend, source = figure.backend, seeds[0]
+    agent = "multi-task agent" if figure.kind == "multitask" else "transfer"
+    found = []
+    for (task, value), (*first, baselines) in grid.panels(figure, seeds).items():
+        lines = [Line(agent, TRANSFER, cells) for cells in first]
+        lines.append(Line("baseline", BASELINE, baselines))
+        title = task if value is None else _titled(figure, value)
+        found.append(Panel(title, task, tuple(lines)))
+    return tuple(found)
 
-    def baseline(task):
-        cells = tuple(grid.baseline(backend, task, seed) for seed in seeds)
-        return Line("baseline", BASELINE, cells)
 
-    if figure.kind == "baselines":
-        return tuple(Panel(task, task, (baseline(task),)) for task in figure.tasks)
-    if figure.kind == "multitask":
-        agent = Line("multi-task agent", TRANSFER, (grid.multitask(backend, figure.tasks, source),))
-        return tuple(Panel(task, task, (agent, baseline(task))) for task in figure.tasks)
-    (task,) = figure.tasks
-    if figure.kind == "ftl":
-        (count,) = figure.counts
-        transfers = {
-            f"ω = {omega:.1f}": tuple(
-                grid.fractional(backend, task, count, omega, seed, source) for seed in seeds
-            )
-            for omega in figure.omegas
-        }
-    else:
-        transfers = {
-            f"{count} source tasks": tuple(
-                grid.meta(backend, task, count, seed, source) for seed in seeds
-            )
-            for count in figure.counts
-        }
-    return tuple(
-        Panel(title, task, (Line("transfer", TRANSFER, cells), baseline(task)))
-        for title, cells in transfers.items()
-    )
+def _titled(figure: Figure, value: float) -> str:
+    return f"ω = {value:.1f}" if figure.kind == "ftl" else f"{value} source tasks"
 
 
 def caption(figure: Figure) -> str:

@@ -59,7 +59,7 @@ def _columns(spec: RunSpec, most: int, tasks: Iterable[str]) -> tuple[str, ...]:
     tasks = tuple(tasks)
     return tuple(
         f"{member.label}, seed {member.seed}"
-        + (f", {envs.spec(task).title}" if len(tasks) > 1 else "")
+        + (f", {envs.described(task).title}" if len(tasks) > 1 else "")
         for member in spec.members[:most]
         for task in tasks
     )

@@ -79,9 +79,11 @@ def findings(
             if table.kind != kind:
                 continue
             entries = comparison.compare(table, outcomes, seeds)
-            begun |= any(e.begun for e in entries.values() if e.sources is not None)
+            begun |= any(
+                e.begun for e in entries.values() if e.sources is not None and e.method is None
+            )
             for entry in entries.values():
-                if entry.transfer is None:
+                if entry.transfer is None or entry.method is not None:
                     continue
                 base = entries[entry.target, None, None]
                 by_target = by_metric.setdefault(table.metric, {})

@@ -17,7 +17,7 @@ def draw_levels(axis, tasks: Iterable[str]) -> None:
     """
     low, high = axis.dataLim.intervaly
     spread = high - low
-    found = {level for task in tasks for level in envs.spec(task).levels}
+    found = {level for task in tasks for level in envs.described(task).levels}
     levels = sorted(
         (value, name) for name, value in found if low - spread <= value <= high + spread
     )

@@ -21,6 +21,7 @@ import numpy as np
 import envs
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Schedule
+from dreamer_jax.schema import EVALUATION_ROW, check_shape
 from experiments.reports import statistics
 from experiments.runs.folder import folders, run_folders, sound
 from experiments.runs.spec import RunSpec, read_spec
@@ -98,6 +99,8 @@ def read_run(folder: str | Path) -> Run:
     by_member: list[list[Mapping[str, Any]]] = [[] for _ in spec.members]
     try:
         for row in rows:
+            if row["kind"] == "evaluation":
+                check_shape(row, EVALUATION_ROW, folder / "metrics.jsonl")
             by_member[row["member"]].append(row)
         outcomes = tuple(_outcome(spec, chosen) for chosen in by_member)
     except (KeyError, IndexError, TypeError) as error:
@@ -146,7 +149,7 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
             outcomes[cell] = Outcome()
             continue
         one = run.outcomes[member]
-        by_title = {envs.spec(task).title: returns for task, returns in one.returns.items()}
+        by_title = {envs.described(task).title: returns for task, returns in one.returns.items()}
         outcomes[cell] = dataclasses.replace(one, returns=by_title)
     return outcomes
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jinja2
 
 from dreamer_jax.files import read_json
+from dreamer_jax.schema import RUN, check_shape
 from envs import SimulatorError
 from experiments.reports import comparison, figures
 from experiments.reports.classification import read_classification
@@ -36,6 +37,7 @@ from experiments.reports.sheet import (
 )
 from experiments.reports.verdicts import LEAST_SEEDS
 from experiments.runs.folder import CELLS, latents_folder
+from experiments.runs.folder import folders as places
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
 from experiments.thesis.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
@@ -103,7 +105,11 @@ def _template() -> jinja2.Template:
 
 def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, Any]:
     """What the template shows."""
-    tables = [grid.on_backend(table, backend) for table in TABLES.values()]
+    held = places(root)
+    tables = [
+        grid.with_compared(grid.on_backend(table, backend), held, seeds)
+        for table in TABLES.values()
+    ]
     pictures = [grid.on_backend(figure, backend) for figure in FIGURES.values()]
     asked = [cell for entry in (*tables, *pictures) for cell in grid.shown(entry, seeds)]
     cells = grid.closure(asked)
@@ -392,7 +398,7 @@ def _provenance(
         if folder not in runs:
             rows.append((folder.name, "-", "-", "cannot be read", "-"))
             continue
-        header = read_json(folder / "run.json")
+        header = check_shape(read_json(folder / "run.json"), RUN, folder / "run.json")
         described = ", ".join(f"{k} {v}" for k, v in header.get("versions", {}).items())
         number = versions.setdefault(described or "unknown", len(versions) + 1)
         rows.append(

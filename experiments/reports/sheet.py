@@ -126,6 +126,13 @@ def returns_sheet(
             (f"{omega:.1f}", tuple(_box(entries[target, n, omega]) for n in table.counts))
             for omega in table.omegas
         ]
+        rows += [
+            (
+                method.capitalize(),
+                tuple(_box(entries[target, n, method]) for n in table.counts),
+            )
+            for method in table.compared
+        ]
         empty = (None,) * (len(table.counts) - 1)
         rows.append(("Baseline", (_box(entries[target, None, None]), *empty)))
     else:
@@ -262,6 +269,7 @@ def _record(table: Table, entry: Entry) -> dict[str, object]:
         "target": entry.target,
         "sources": entry.sources,
         "omega": entry.omega,
+        "method": entry.method,
         "metric": table.metric,
         "seeds": len(entry.scores),
         "failed": len(entry.failed),

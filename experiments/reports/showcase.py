@@ -94,7 +94,7 @@ def sentence(run: Run, task: str, source: str) -> str:
       task: the name of the target.
       source: what the source is called.
     """
-    title = envs.spec(task).title
+    title = envs.described(task).title
     best = max(effects(run, task), key=lambda effect: abs(effect.difference))
     baseline = _curves(run, task)[BASELINE]
     seeds, steps = len(baseline), run.outcomes[0].env_steps
@@ -146,7 +146,9 @@ def source_panel(source: Source, task: str, workers: int | None = None) -> Panel
     Raises:
       ModuleNotFoundError: the task's simulator is not installed.
     """
-    alike = [one for one in source.spec.tasks if envs.spec(one).title == envs.spec(task).title]
+    alike = [
+        one for one in source.spec.tasks if envs.described(one).title == envs.described(task).title
+    ]
     own = (alike or list(source.spec.tasks))[0]
     spec = RunSpec((own,), (0,), source.spec.config)
     params = jax.tree.map(lambda x: jnp.asarray(x)[None], source.params)

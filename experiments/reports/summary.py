@@ -215,7 +215,7 @@ def compared_panels(runs: Sequence[Run]) -> list[Panel]:
         found = _curves(run, name)
         called = titles(found)
         for task, curves in found.items():
-            title = envs.spec(task).title
+            title = envs.described(task).title
             if called[task] != title:
                 curves = [replace(curve, text=f"{curve.text}, {task}") for curve in curves]
             by_title.setdefault(title, []).extend(curves)

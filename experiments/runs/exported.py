@@ -66,7 +66,7 @@ class Card:
         returns = self.returns[task]
         mean, spread = statistics.fmean(returns), np.std(returns)
         words = f"{mean:.0f} ± {spread:.0f} in {len(returns)} episodes"
-        (known,) = envs.specs((task,))
+        known = envs.described(task)
         idle = {name: value for name, value in known.levels if name != "balanced"}
         if not idle:
             return f"{words}; no level is known to compare it with"

@@ -11,6 +11,7 @@ from dreamer_jax import config as configs
 from dreamer_jax.config import Config, Difference
 from dreamer_jax.integrity import read_sealed_json
 from dreamer_jax.ranges import check_ranges
+from dreamer_jax.schema import RUN, check_shape
 from experiments import methods
 from experiments.methods.base import BASELINE as BASELINE
 from experiments.methods.base import Method, require
@@ -40,7 +41,8 @@ class RunSpec:
     def __post_init__(self):
         choices = ", ".join([*envs.task_names(), "gymnasium/ID"])
         require(self.tasks, f"no task given: choose from {choices}")
-        envs.specs(self.tasks)
+        for task in self.tasks:
+            envs.described(task)
         require(len(set(self.tasks)) == len(self.tasks), f"a task is named twice: {self.tasks}")
         require(self.seeds, "no seed given")
         require(len(set(self.seeds)) == len(self.seeds), f"a seed is named twice: {self.seeds}")
@@ -127,7 +129,11 @@ def read_spec(directory: str | Path) -> RunSpec:
             f"{directory} holds no run (there is no {path.name} in it); "
             "make one with: python -m experiments train --task ... --out " + str(directory)
         )
-    return RunSpec.from_dict(read_sealed_json(path)["spec"])
+    header = check_shape(read_sealed_json(path), RUN, path)
+    try:
+        return RunSpec.from_dict(header["spec"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def action_size(tasks: tuple[str, ...]) -> int:

@@ -9,7 +9,7 @@ import envs
 def titles(tasks: Iterable[str]) -> dict[str, str]:
     """What each of some tasks is called beside the others: its title, or its name where another
     simulator's has the same."""
-    found = {task: envs.spec(task).title for task in tasks}
+    found = {task: envs.described(task).title for task in tasks}
     count = Counter(found.values())
     return {task: title if count[title] == 1 else task for task, title in found.items()}
 

@@ -29,7 +29,11 @@ from envs.pool import available_cores
 from experiments.runs.agents import make_agent
 from experiments.runs.spec import RunSpec, action_size
 from experiments.runs.text import aligned
+from experiments.thesis import flops
 from experiments.thesis.graph import PlannedRun
+
+SAMPLE_OPERATIONS = 1e11
+"""An update that does no more than this is measured as it is."""
 
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
 SLACK = 1.5
@@ -80,36 +84,101 @@ class Estimate:
     disk: int
 
 
-def _batch(agent: Agent, members: int) -> Records:
-    """Records of the sizes of a batch, leaves [P, B, L, ...]."""
+def _shapes(agent: Agent, members: int) -> Records:
+    """A batch's shapes and dtypes, leaves [P, B, L, ...]."""
     learning, size = agent.config.learning, agent.config.network.image_size
     shape = (members, learning.batch_size, learning.sequence_length)
-    random = np.random.default_rng(0)
     return Records(
-        image=random.integers(0, 256, (*shape, size, size, 3), dtype=np.uint8),
-        action=np.zeros((*shape, agent.action_size), np.float32),
-        reward=np.zeros(shape, np.float32),
-        first=np.zeros(shape, bool),
-        terminal=np.zeros(shape, bool),
+        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
+        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
+        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
+        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
+        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
     )
+
+
+def _batch(agent: Agent, members: int) -> Records:
+    """Records of the sizes of a batch, leaves [P, B, L, ...]."""
+    random, shapes = np.random.default_rng(0), _shapes(agent, members)
+    batch = Records(*(np.zeros(x.shape, x.dtype) for x in shapes))
+    return batch._replace(image=random.integers(0, 256, batch.image.shape, dtype=np.uint8))
+
+
+def _made_up_state(agent: Agent):
+    """A state of one member, leaves [1, ...], without compiling what makes real ones."""
+    shapes = jax.eval_shape(
+        functools.partial(init_members, agent), jax.ShapeDtypeStruct((1,), jnp.int32)
+    )
+    random = np.random.default_rng(0)
+
+    def make(leaf):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jnp.broadcast_to(jax.random.key(0), leaf.shape)
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jnp.asarray(random.normal(0, 0.03, leaf.shape), leaf.dtype)
+        return jnp.ones(leaf.shape, leaf.dtype)
+
+    state = jax.tree.map(make, shapes)
+    optimisers = jax.tree.map(jnp.zeros_like, state.optimisers)
+    return dataclasses.replace(state, optimisers=optimisers)
 
 
 @functools.cache
 def _compiled_update(agent: Agent):
     """One member's update, compiled, with what it is called on."""
-    learning = agent.config.learning
-    state = init_members(agent, jnp.zeros(1, jnp.int32))
+    learning, state = agent.config.learning, _made_up_state(agent)
     sums = zero_sums(agent, state, learning.batch_size, learning.sequence_length)
     batch = _batch(agent, 1)
     lowered = update_members.lower(agent, state, sums, batch, mapping="auto", chunk=1)
     return lowered.compile(), state, sums, batch
 
 
+def sample_of(agent: Agent) -> tuple[Agent, float]:
+    """An agent with smaller batches, whose update can be measured in seconds and little memory.
+
+    Returns:
+      The agent, the same networks with a part of the sequences and of their length; and how many
+      times the arithmetic of its update the given agent's is. The agent itself and 1, where its
+      update is small.
+    """
+    whole = _operations(agent)
+    if whole <= SAMPLE_OPERATIONS:
+        return agent, 1.0
+    learning = agent.config.learning
+    batch, length = (max(1, n // 4) for n in (learning.batch_size, learning.sequence_length))
+    starts = learning.imagination_starts
+    if starts is not None:
+        starts = max(1, starts * batch * length // (learning.batch_size * learning.sequence_length))
+    learning = dataclasses.replace(
+        learning, batch_size=batch, sequence_length=length, imagination_starts=starts
+    )
+    config = dataclasses.replace(agent.config, learning=learning)
+    part = dataclasses.replace(agent, config=config)
+    return part, whole / _operations(part)
+
+
+def _operations(agent: Agent) -> float:
+    """Of one member's update."""
+    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), _shapes(agent, 1))
+    return flops.count(agent.update, state, batch)
+
+
+def _scaled_bytes(agent: Agent, part: Agent, temporary: int) -> int:
+    """Memory of an update from that of one on smaller batches: gradients do not grow with them."""
+    records = [
+        x.config.learning.batch_size * x.config.learning.sequence_length for x in (agent, part)
+    ]
+    fixed = min(temporary, _member_bytes(agent))
+    return int(fixed + (temporary - fixed) * records[0] / records[1])
+
+
 def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     """Measures the updates and the simulators of runs of one preset.
 
-    A plain agent of the largest action size stands for all of them. Nearly all of the time goes to
-    compilation, half a minute or so for each thing to be measured.
+    A plain agent of the largest action size stands for all of them. An update that is large is
+    measured on smaller batches, and multiplied by how much more arithmetic it does (see
+    `sample_of`). Nearly all of the time goes to compilation.
 
     Args:
       specs: the runs.
@@ -122,20 +191,21 @@ def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     agent = make_agent(RunSpec((widest,), (0,), specs[0].config))
     report(1, things, "an update and a policy")
     started = time.perf_counter()
-    update, state, sums, batch = _compiled_update(agent)
-    policy_seconds = _policy_seconds(agent, state.params)
+    part, times = sample_of(agent)
+    update, state, sums, batch = _compiled_update(part)
+    policy_seconds = _policy_seconds(part, state.params)
     compile_seconds = time.perf_counter() - started
-    update_bytes = update.memory_analysis().temp_size_in_bytes
+    update_bytes = _scaled_bytes(agent, part, update.memory_analysis().temp_size_in_bytes)
     # The state is donated: a copy of it is.
     state = jax.tree.map(jnp.copy, state)
     state, sums, loss = update(state, jax.tree.map(jnp.copy, sums), batch)
     loss.block_until_ready()
     took: list[float] = []
-    while sum(took) < UPDATE_SECONDS:
+    while sum(took) < times * UPDATE_SECONDS:
         started = time.perf_counter()
         state, sums, loss = update(state, sums, batch)
         loss.block_until_ready()
-        took.append(time.perf_counter() - started)
+        took.append(times * (time.perf_counter() - started))
     fast, middle, slow = np.quantile(took, [0.1, 0.5, 0.9]).tolist()
     ticks = {}
     for number, task in enumerate(tasks, start=2):

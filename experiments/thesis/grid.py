@@ -6,7 +6,7 @@ the whole is a graph in which each agent occurs once, whoever asks for it.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,6 +33,8 @@ SEEDS = (0, 1, 2)
 """Seeds of targets and baselines; a source agent is a single run, of the first of them."""
 THRESHOLDS = (50.0, 70.0, 90.0)
 """Thresholds ξ of latent task classification, for M = 230 latent features."""
+COMPARED = ("fine-tuning", "frozen-source")
+"""Methods that are not the thesis's and may be shown beside its own."""
 AUTOENCODER = ("Hopper", "Ant")
 """The tasks of the agent whose autoencoder is the universal one (section 4.3.1)."""
 
@@ -91,6 +93,8 @@ class Table:
       counts: numbers of source tasks.
       omegas: fractions.
       backend: the simulator.
+      compared: names of other methods, from the same sources, shown beside those of the thesis in
+        tables of fractional transfer.
     """
 
     name: str
@@ -101,6 +105,7 @@ class Table:
     counts: tuple[int, ...] = COUNTS
     omegas: tuple[float, ...] = OMEGAS
     backend: Backend = "bullet"
+    compared: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -222,38 +227,128 @@ def meta(backend: Backend, target: str, count: int, seed: int, source: int) -> C
     return Cell(backend, (target,), "meta", seed, autoencoder, reward_sources=stored)
 
 
-def shown(entry: Table | Figure, seeds: tuple[int, ...] = SEEDS) -> tuple[Cell, ...]:
-    """The cells that a table or figure shows, baselines last.
+def compared(
+    backend: Backend, target: str, count: int, method: str, seed: int, source: int
+) -> Cell:
+    """A target that another method makes of the agent of `count` tasks."""
+    agent = multitask(backend, SOURCES[target][:count], source)
+    return Cell(backend, (target,), method, seed, agent)
+
+
+# --- what is shown --------------------------------------------------------------------------------
+
+Key = tuple[str, int | None, float | str | None]
+"""Which entry of a table of returns: the target; the number of source tasks, None for the baseline;
+the fraction, or the name of the method where it is not the table's own."""
+
+
+def entries(table: Table, seeds: Sequence[int] = SEEDS) -> dict[Key, tuple[Cell, ...]]:
+    """The cells of each entry of a table of returns, one per seed; a target's baseline first."""
+    backend, source = table.backend, seeds[0]
+    found: dict[Key, tuple[Cell, ...]] = {}
+    for target in table.targets:
+        found[target, None, None] = _baselines(backend, target, seeds)
+        if table.kind == "meta":
+            for count in table.counts:
+                found[target, count, None] = tuple(
+                    meta(backend, target, count, seed, source) for seed in seeds
+                )
+            continue
+        for omega in table.omegas:
+            for count in table.counts:
+                found[target, count, omega] = tuple(
+                    fractional(backend, target, count, omega, seed, source) for seed in seeds
+                )
+        for method in table.compared:
+            for count in table.counts:
+                found[target, count, method] = tuple(
+                    compared(backend, target, count, method, seed, source) for seed in seeds
+                )
+    return found
+
+
+def panels(
+    figure: Figure, seeds: Sequence[int] = SEEDS
+) -> dict[tuple[str, int | float | None], tuple[tuple[Cell, ...], ...]]:
+    """The cells of each panel of a figure of learning curves.
+
+    Returns:
+      Title of the panel's task, and the fraction or number of sources, if they differ -> the cells
+      of each of its lines, one per seed: the transfers or the source agent, then the baseline.
+    """
+    backend, source = figure.backend, seeds[0]
+    base = {task: _baselines(backend, task, seeds) for task in figure.tasks}
+    if figure.kind == "tasks":
+        return {}
+    if figure.kind == "baselines":
+        return {(task, None): (base[task],) for task in figure.tasks}
+    if figure.kind == "multitask":
+        agent = (multitask(backend, figure.tasks, source),)
+        return {(task, None): (agent, base[task]) for task in figure.tasks}
+    (task,) = figure.tasks
+    if figure.kind == "meta":
+        return {
+            (task, count): (
+                tuple(meta(backend, task, count, seed, source) for seed in seeds),
+                base[task],
+            )
+            for count in figure.counts
+        }
+    (count,) = figure.counts
+    return {
+        (task, omega): (
+            tuple(fractional(backend, task, count, omega, seed, source) for seed in seeds),
+            base[task],
+        )
+        for omega in figure.omegas
+    }
+
+
+def _baselines(backend: Backend, task: str, seeds: Sequence[int]) -> tuple[Cell, ...]:
+    return tuple(baseline(backend, task, seed) for seed in seeds)
+
+
+def shown(entry: Table | Figure, seeds: Sequence[int] = SEEDS) -> tuple[Cell, ...]:
+    """The cells that a table or figure shows, each once, baselines last.
 
     A table of latent task classification shows samples of one agent; figures of the tasks none.
     """
-    backend, source = entry.backend, seeds[0]
     if entry.kind == "ltc":
-        return (multitask(backend, AUTOENCODER, source),)
-    if entry.kind == "tasks":
-        return ()
-    targets = entry.targets if isinstance(entry, Table) else entry.tasks
-    scratch = tuple(baseline(backend, task, seed) for task in targets for seed in seeds)
-    if entry.kind == "baselines":
-        return scratch
-    if entry.kind == "multitask":
-        return (multitask(backend, targets, source), *scratch)
-    if entry.kind == "meta":
-        cells = (
-            meta(backend, target, count, seed, source)
-            for target in targets
-            for count in entry.counts
-            for seed in seeds
-        )
+        return (multitask(entry.backend, AUTOENCODER, seeds[0]),)
+    if isinstance(entry, Table):
+        groups = list(entries(entry, seeds).values())
     else:
-        cells = (
-            fractional(backend, target, count, omega, seed, source)
-            for target in targets
-            for count in entry.counts
-            for omega in entry.omegas
-            for seed in seeds
+        groups = [cells for lines in panels(entry, seeds).values() for cells in lines]
+    cells = dict.fromkeys(cell for group in groups for cell in group)
+    # Those that are made from others come first; a source agent is no baseline.
+    return tuple(sorted(cells, key=lambda cell: cell.source is None and len(cell.tasks) == 1))
+
+
+def with_compared(
+    entry: Table | Figure, held: Container[str], seeds: Sequence[int] = SEEDS
+) -> Table | Figure:
+    """A table with the rows of all methods of comparison of which there are cells.
+
+    Args:
+      entry: a table; anything else is given back as it is.
+      held: names of the cells that are there.
+      seeds: see `entries`.
+    """
+    if entry.kind != "ftl" or isinstance(entry, Figure):
+        return entry
+    whole = dataclasses.replace(entry, compared=COMPARED)
+    there = [
+        method
+        for method in COMPARED
+        if method in entry.compared
+        or any(
+            cell.name in held
+            for (_, _, variant), cells in entries(whole, seeds).items()
+            if variant == method
+            for cell in cells
         )
-    return (*cells, *scratch)
+    ]
+    return dataclasses.replace(entry, compared=tuple(there))
 
 
 def closure(cells: Iterable[Cell]) -> tuple[Cell, ...]:

@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ import jax
 from dreamer_jax import config as configs
 from dreamer_jax.config import Config
 from dreamer_jax.files import write_json_atomically
+from dreamer_jax.progress import Report, unreported
 from envs.pool import available_cores
 from experiments.runs.spec import RunSpec
 from experiments.thesis.estimate import Speed, measure
@@ -51,7 +52,7 @@ def speed_of(
     folder: Path,
     *,
     again: bool = False,
-    tell: Callable[[str], None] = lambda what: None,
+    report: Report = unreported,
 ) -> Known:
     """How fast this machine is at runs of one preset.
 
@@ -62,14 +63,14 @@ def speed_of(
       specs: the runs.
       folder: where measurements are kept.
       again: measures in any case.
-      tell: is told what is measured next.
+      report: called before each measurement with what it is of.
     """
     path = folder / f"{_key(specs[0].config)}.json"
     before = _read(path)
     tasks = {task for spec in specs for task in spec.tasks}
     if before is not None and not again and tasks <= set(before.tick_seconds):
         return Known(before, path, kept=True)
-    found = measure(specs, tell)
+    found = measure(specs, report)
     if before is not None:
         found = dataclasses.replace(
             found,

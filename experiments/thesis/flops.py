@@ -1,0 +1,50 @@
+"""Arithmetic operations of a program, counted in its trace: nothing is compiled, nothing runs."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+
+
+def count(function: Callable, *arguments: Any) -> float:
+    """Operations of one call: two for each multiplication and addition of a product of matrices or
+    a convolution, one for each number that anything else makes. Loops count every turn.
+
+    Args:
+      function: what JAX can trace.
+      arguments: arrays, or `jax.ShapeDtypeStruct` in their place.
+    """
+    return _of_jaxpr(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _of_jaxpr(jaxpr) -> float:
+    return sum(_of_equation(equation) for equation in jaxpr.eqns)
+
+
+def _of_equation(equation) -> float:
+    name, parameters = equation.primitive.name, equation.params
+    made = sum(math.prod(variable.aval.shape) for variable in equation.outvars)
+    if name == "dot_general":
+        (contracted, _), _ = parameters["dimension_numbers"]
+        shape = equation.invars[0].aval.shape
+        return 2.0 * made * math.prod(shape[axis] for axis in contracted)
+    if name == "conv_general_dilated":
+        kernel = equation.invars[1].aval.shape
+        outputs = kernel[parameters["dimension_numbers"].rhs_spec[0]]
+        return 2.0 * made * math.prod(kernel) / outputs
+    inner = [_of_jaxpr(jaxpr) for jaxpr in _jaxprs(parameters)]
+    if not inner:
+        return float(made)
+    if name == "scan":
+        return parameters["length"] * sum(inner)
+    return max(inner) if name == "cond" else sum(inner)
+
+
+def _jaxprs(parameters: dict[str, Any]) -> Iterator[Any]:
+    """The programs among an operation's parameters."""
+    for value in parameters.values():
+        for one in value if isinstance(value, tuple | list) else (value,):
+            inner = getattr(one, "jaxpr", one)
+            if hasattr(inner, "eqns"):
+                yield inner
