@@ -11,19 +11,20 @@ class RecordsError(RuntimeError):
     """An environment or a policy gave what cannot be learned from."""
 
 
-def check_records(records: Records, tasks: Sequence[str]) -> None:
+def check_records(records: Records, tasks: Sequence[str], healthy: np.ndarray) -> None:
     """Checks the records of one phase.
 
     Args:
       records: NumPy leaves [P, K, T + 1, ...].
       tasks: names of the K tasks.
+      healthy: bool [P]; nothing is expected of members that are frozen.
 
     Raises:
       RecordsError: a number is not finite; names member, task and tick.
     """
     for what in ("reward", "action"):
         values = getattr(records, what)
-        finite = np.isfinite(values)
+        finite = np.isfinite(values) | ~healthy.reshape(-1, *[1] * (values.ndim - 1))
         if not finite.all():
             member, task, tick, *_ = np.argwhere(~finite)[0].tolist()
             value = np.atleast_1d(values[member, task, tick])

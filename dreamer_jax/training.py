@@ -316,7 +316,7 @@ class Run:
         )
         records = to_host(records)
         self.env.check()
-        check_records(records, self.tasks)
+        check_records(records, self.tasks, self._healthy)
         self._time("evaluate" if mode == "evaluate" else "collect", started)
         return records
 
@@ -334,7 +334,7 @@ class Run:
                 self.state, self.sums, rounds, updates, mode
             )
             self.env.check()
-            check_records(records, self.tasks)
+            check_records(records, self.tasks, self._healthy)
             self._time("round", started, updates=len(updates))
             self._commit(records, mode)
         except Exception:

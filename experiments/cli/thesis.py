@@ -253,6 +253,11 @@ def plan(command: Plan) -> int:
             f"and {ticks:.1f} ms for a tick of the\nslowest simulator, measured {when}.\n"
             "Runs come one after another; each is compiled first."
         )
+        if known.speed.scaled > 1:
+            print(
+                "The update was measured on smaller batches, and multiplied by "
+                f"{known.speed.scaled:.3g}: its time may be off by {estimate.SCALING_ERROR:.0%}."
+            )
     return 0
 
 

@@ -21,7 +21,6 @@ import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.device_round import on_device, replay_bytes
-from dreamer_jax.population import init_members, update_members, zero_sums
 from dreamer_jax.progress import Report, unreported
 from dreamer_jax.records import Records
 from dreamer_jax.schedule import Schedule
@@ -34,6 +33,10 @@ from experiments.thesis.graph import PlannedRun
 
 SAMPLE_OPERATIONS = 1e11
 """An update that does no more than this is measured as it is."""
+
+SCALING_ERROR = 0.5
+"""By how much the time of a large update may differ from that scaled from smaller batches
+(docs/reliability.md has what was measured)."""
 
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
 SLACK = 1.5
@@ -57,6 +60,8 @@ class Speed:
       tick_compile_seconds: until a tick of a simulator is, by name of task; physics that is part
         of the program takes long.
       workers: simulator processes that work at once.
+      scaled: by how much the time of an update on smaller batches was multiplied; 1 if the update
+        itself was measured.
     """
 
     update_seconds: float
@@ -67,6 +72,7 @@ class Speed:
     compile_seconds: float
     tick_compile_seconds: Mapping[str, float]
     workers: int
+    scaled: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -84,53 +90,39 @@ class Estimate:
     disk: int
 
 
-def _shapes(agent: Agent, members: int) -> Records:
-    """A batch's shapes and dtypes, leaves [P, B, L, ...]."""
+@functools.cache
+def _traced_update(agent: Agent):
+    """One member's update, traced for its shapes."""
     learning, size = agent.config.learning, agent.config.network.image_size
-    shape = (members, learning.batch_size, learning.sequence_length)
-    return Records(
+    shape = (learning.batch_size, learning.sequence_length)
+    batch = Records(
         image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
         action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
         reward=jax.ShapeDtypeStruct(shape, jnp.float32),
         first=jax.ShapeDtypeStruct(shape, jnp.bool_),
         terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
     )
-
-
-def _batch(agent: Agent, members: int) -> Records:
-    """Records of the sizes of a batch, leaves [P, B, L, ...]."""
-    random, shapes = np.random.default_rng(0), _shapes(agent, members)
-    batch = Records(*(np.zeros(x.shape, x.dtype) for x in shapes))
-    return batch._replace(image=random.integers(0, 256, batch.image.shape, dtype=np.uint8))
-
-
-def _made_up_state(agent: Agent):
-    """A state of one member, leaves [1, ...], without compiling what makes real ones."""
-    shapes = jax.eval_shape(
-        functools.partial(init_members, agent), jax.ShapeDtypeStruct((1,), jnp.int32)
-    )
-    random = np.random.default_rng(0)
-
-    def make(leaf):
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jnp.broadcast_to(jax.random.key(0), leaf.shape)
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-            return jnp.asarray(random.normal(0, 0.03, leaf.shape), leaf.dtype)
-        return jnp.ones(leaf.shape, leaf.dtype)
-
-    state = jax.tree.map(make, shapes)
-    optimisers = jax.tree.map(jnp.zeros_like, state.optimisers)
-    return dataclasses.replace(state, optimisers=optimisers)
+    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
+    return jax.jit(agent.update).trace(state, batch), state, batch
 
 
 @functools.cache
 def _compiled_update(agent: Agent):
-    """One member's update, compiled, with what it is called on."""
-    learning, state = agent.config.learning, _made_up_state(agent)
-    sums = zero_sums(agent, state, learning.batch_size, learning.sequence_length)
-    batch = _batch(agent, 1)
-    lowered = update_members.lower(agent, state, sums, batch, mapping="auto", chunk=1)
-    return lowered.compile(), state, sums, batch
+    """One member's update, compiled, with a state and a batch of made-up numbers."""
+    traced, state, batch = _traced_update(agent)
+    random = np.random.default_rng(0)
+
+    def make(leaf):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jnp.asarray(random.normal(0, 0.03, leaf.shape), leaf.dtype)
+        return jnp.ones(leaf.shape, leaf.dtype)
+
+    state = jax.tree.map(make, state)
+    optimisers = jax.tree.map(jnp.zeros_like, state.optimisers)
+    state = dataclasses.replace(state, optimisers=optimisers)
+    image = random.integers(0, 256, batch.image.shape, dtype=np.uint8)
+    batch = batch.map(lambda x: np.zeros(x.shape, x.dtype))._replace(image=image)
+    return traced.lower().compile(), state, batch
 
 
 def sample_of(agent: Agent) -> tuple[Agent, float]:
@@ -159,9 +151,7 @@ def sample_of(agent: Agent) -> tuple[Agent, float]:
 
 def _operations(agent: Agent) -> float:
     """Of one member's update."""
-    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
-    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), _shapes(agent, 1))
-    return flops.count(agent.update, state, batch)
+    return flops.of_jaxpr(_traced_update(agent)[0].jaxpr.jaxpr)
 
 
 def _scaled_bytes(agent: Agent, part: Agent, temporary: int) -> int:
@@ -192,19 +182,17 @@ def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     report(1, things, "an update and a policy")
     started = time.perf_counter()
     part, times = sample_of(agent)
-    update, state, sums, batch = _compiled_update(part)
+    update, state, batch = _compiled_update(part)
     policy_seconds = _policy_seconds(part, state.params)
     compile_seconds = time.perf_counter() - started
     update_bytes = _scaled_bytes(agent, part, update.memory_analysis().temp_size_in_bytes)
-    # The state is donated: a copy of it is.
-    state = jax.tree.map(jnp.copy, state)
-    state, sums, loss = update(state, jax.tree.map(jnp.copy, sums), batch)
-    loss.block_until_ready()
+    state, metrics = update(state, batch)
+    metrics["model_loss"].block_until_ready()
     took: list[float] = []
     while sum(took) < times * UPDATE_SECONDS:
         started = time.perf_counter()
-        state, sums, loss = update(state, sums, batch)
-        loss.block_until_ready()
+        state, metrics = update(state, batch)
+        metrics["model_loss"].block_until_ready()
         took.append(times * (time.perf_counter() - started))
     fast, middle, slow = np.quantile(took, [0.1, 0.5, 0.9]).tolist()
     ticks = {}
@@ -220,6 +208,7 @@ def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
         compile_seconds=compile_seconds,
         tick_compile_seconds={task: first for task, (_, first) in ticks.items()},
         workers=available_cores(),
+        scaled=times,
     )
 
 
@@ -237,10 +226,9 @@ def _policy_seconds(agent: Agent, params) -> float:
         keys = jax.random.split(jax.random.key(0), TICKS)
         return jax.lax.scan(tick, agent.initial_carry(), keys)[1]
 
-    one = jax.tree.map(lambda x: x[0], params)
-    act(one).block_until_ready()
+    act(params).block_until_ready()
     started = time.perf_counter()
-    act(one).block_until_ready()
+    act(params).block_until_ready()
     return (time.perf_counter() - started) / TICKS
 
 

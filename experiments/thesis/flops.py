@@ -15,10 +15,11 @@ def count(function: Callable, *arguments: Any) -> float:
       function: what JAX can trace.
       arguments: arrays, or `jax.ShapeDtypeStruct` in their place.
     """
-    return _of_jaxpr(jax.make_jaxpr(function)(*arguments).jaxpr)
+    return of_jaxpr(jax.make_jaxpr(function)(*arguments).jaxpr)
 
 
-def _of_jaxpr(jaxpr) -> float:
+def of_jaxpr(jaxpr: Any) -> float:
+    """Operations of a trace; see `count`."""
     return sum(_of_equation(equation) for equation in jaxpr.eqns)
 
 
@@ -33,7 +34,7 @@ def _of_equation(equation) -> float:
         kernel = equation.invars[1].aval.shape
         outputs = kernel[parameters["dimension_numbers"].rhs_spec[0]]
         return 2.0 * made * math.prod(kernel) / outputs
-    inner = [_of_jaxpr(jaxpr) for jaxpr in _jaxprs(parameters)]
+    inner = [of_jaxpr(jaxpr) for jaxpr in _jaxprs(parameters)]
     if not inner:
         return float(made)
     if name == "scan":
