@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from typing import Any, TextIO
+from typing import Any, TextIO, cast
 
 
 class SafeStream:
@@ -59,7 +59,7 @@ class SafeStream:
 @contextlib.contextmanager
 def safe_output():
     """Has everything that is printed meanwhile go through safe streams."""
-    streams = SafeStream(sys.stdout), SafeStream(sys.stderr)
+    streams = [cast(TextIO, SafeStream(stream)) for stream in (sys.stdout, sys.stderr)]
     with contextlib.redirect_stdout(streams[0]), contextlib.redirect_stderr(streams[1]):
         try:
             yield

@@ -6,7 +6,7 @@ Axis letters: P population member, K task.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -19,6 +19,8 @@ from dreamer_jax.logs import read_metrics
 from dreamer_jax.replay import Replay
 from dreamer_jax.schema import METADATA, REPLAY, check_shape
 
+State = Literal["sound", "damaged", "unchecked"]
+
 
 class Finding(NamedTuple):
     """What was found of one part of a folder.
@@ -30,7 +32,7 @@ class Finding(NamedTuple):
     """
 
     part: str
-    state: Literal["sound", "damaged", "unchecked"]
+    state: State
     text: str
 
 
@@ -41,12 +43,11 @@ def verify(directory: str | os.PathLike) -> list[Finding]:
     """
     directory = Path(directory)
     findings, committed = _checkpoints(Checkpointer(directory / "checkpoints"))
-    parts: list[Callable[[Path, list[dict]], Iterable[Finding]]] = [_replay, _metrics]
-    for part in parts:
+    for name, part in (("replay", _replay), ("metrics.jsonl", _metrics)):
         try:
             findings += part(directory, committed)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            findings.append(Finding(part.__name__.strip("_"), "damaged", str(error)))
+            findings.append(Finding(name, "damaged", str(error)))
     return findings
 
 

@@ -35,8 +35,9 @@ SIMULATOR_TIMEOUT = 300.0
 """
 
 # Seconds after which that is warned of (and again after twice as many), those that are left to a
-# simulator once whoever waits has asked not to wait, and those that a process has to start.
-_PATIENCE, _HURRY, _START = 10.0, 5.0, 120.0
+# simulator once whoever waits has asked not to wait. A process takes longer for its start, on a
+# busy machine above all: after how many seconds that is warned of, and how many it has at least.
+_PATIENCE, _HURRY, _SLOW_START, _START = 10.0, 5.0, 60.0, 120.0
 
 _BOOTSTRAP = (
     "import sys; sys.path[:] = sys.argv[4:]; "
@@ -138,7 +139,8 @@ class SimulatorPool:
                     )
         try:
             starting = max(timeout, _START)
-            if failures := self._replies({index: [] for index in range(count)}, starting):
+            started: dict[int, list[int]] = {index: [] for index in range(count)}
+            if failures := self._replies(started, starting, patience=_SLOW_START):
                 raise self._start_error(min(failures))
         except BaseException:
             self.close()
@@ -198,7 +200,9 @@ class SimulatorPool:
         for them wants to stop. May be called from another thread."""
         self._hurried = True
 
-    def _replies(self, asked: Mapping[int, list[int]], timeout: float) -> list:
+    def _replies(
+        self, asked: Mapping[int, list[int]], timeout: float, patience: float | None = None
+    ) -> list:
         """Wait for replies; returns the failures that they report.
 
         All replies are read before an error is raised. Those to an earlier request, whose wait
@@ -207,10 +211,11 @@ class SimulatorPool:
         Args:
             asked: of each worker asked, the slots, in the order in which it does them.
             timeout: seconds for which to wait.
+            patience: seconds after which to warn first, by default a few.
         """
         pending = {self._workers[index].connection: index for index in asked}
         failures, error = [], None
-        began, warned = time.monotonic(), _PATIENCE
+        began, warned = time.monotonic(), _PATIENCE if patience is None else patience
         deadline = time.perf_counter() + self._active_wait
         while not wait(list(pending), timeout=0) and time.perf_counter() < deadline:
             os.sched_yield()

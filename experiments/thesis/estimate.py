@@ -35,8 +35,8 @@ SAMPLE_OPERATIONS = 1e11
 """An update that does no more than this is measured as it is."""
 
 SCALING_ERROR = 0.5
-"""By how much the time of a large update may differ from that scaled from smaller batches
-(docs/reliability.md has what was measured)."""
+"""By how much the time of a large update may differ from that scaled from smaller batches: an
+allowance, for small products of matrices use a machine less well than large ones."""
 
 UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
 SLACK = 1.5

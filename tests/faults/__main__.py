@@ -8,9 +8,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.faults import damages, hostile, kills, others
+from tests.faults import commits, damages, hostile, kills, others
 
-PARTS = ("kills", "damages", "hostile", "disks", "writers")
+PARTS = ("commits", "kills", "damages", "hostile", "disks", "writers")
 
 
 def main() -> int:
@@ -35,6 +35,16 @@ def main() -> int:
                     print(f"FAILED: {failure}", flush=True)
     print("\n".join(["", *lines]))
     return 1 if bad else 0
+
+
+def _commits(options, folder):
+    outcome = commits.kill_commits(options.kills, folder / "commits", options.seed)
+    identical = outcome.chains - len(outcome.different)
+    yield (
+        f"commits: {outcome.kills} kills in {outcome.chains} folders, {identical} of them resumed "
+        "to the same end, byte for byte",
+        outcome.different,
+    )
 
 
 def _kills(options, folder):
@@ -97,7 +107,7 @@ def _say(text: str) -> None:
     print(text, flush=True)
 
 
-_PARTS = dict(zip(PARTS, (_kills, _damages, _hostile, _disks, _writers), strict=True))
+_PARTS = dict(zip(PARTS, (_commits, _kills, _damages, _hostile, _disks, _writers), strict=True))
 
 if __name__ == "__main__":
     sys.exit(main())

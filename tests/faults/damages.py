@@ -50,12 +50,20 @@ def state(number: int) -> dict:
 
 def make_folder(directory: Path, phases: int = 4) -> Path:
     """A results folder of two members, with all files that a run's has."""
-    directory.mkdir(parents=True)
+    directory.mkdir(parents=True, exist_ok=True)
     content = {"spec": SPEC.to_dict(), "cells": ["one", "two"], "revision": "made up"}
     write_sealed_json(directory / "run.json", content)
     (directory / "cells.json").write_text('["one", "two"]\n')
+    go_on(directory, phases)
+    return directory
+
+
+def go_on(directory: Path, phases: int, every: int = 1) -> None:
+    """Begins or resumes what stands for a training: records, metrics, and a checkpoint now and
+    then, all functions of the number of the phase."""
     folder = RunFolder(directory, lock=None, resume=True, layout=LAYOUT)
-    for number in range(phases):
+    found = folder.restore(state(0))
+    for number in range(found[1]["rounds"] if found else 0, phases):
         chance, shape = np.random.default_rng(number), (2, 1, 21)
         folder.replay.append(
             Records(
@@ -70,10 +78,10 @@ def make_folder(directory: Path, phases: int = 4) -> Path:
             row = {"kind": "evaluation", "member": member, "seed": member, "label": "baseline"}
             row |= {"env_steps": 40 * number, "task": SPEC.tasks[0], "return": chance.normal()}
             folder.writer.write(row)
-        counters = {"rounds": number + 1, "updates": 2 * number, "evaluations": number}
-        folder.save(number + 1, state(number), {**counters, "averaged": 0})
+        if number % every == every - 1 or number == phases - 1:
+            counters = {"rounds": number + 1, "updates": 2 * number, "evaluations": number}
+            folder.save(number + 1, state(number), {**counters, "averaged": 0})
     folder.close()
-    return directory
 
 
 def read_all(directory: Path) -> tuple:
