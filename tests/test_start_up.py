@@ -91,6 +91,7 @@ def asked(monkeypatch):
     specs = []
     monkeypatch.setattr("experiments.runs.run.make_run", lambda spec, out, **_: specs.append(spec))
     monkeypatch.setattr("experiments.runs.run.carry_out", lambda run: "stopped")
+    monkeypatch.setattr("experiments.runs.trust.check_trust", lambda *_: None)
     monkeypatch.setattr("pathlib.Path.read_text", read_text)
     return specs
 

@@ -83,14 +83,15 @@ class Train:
 def train_options() -> type:
     """The options of `train`: a group for the run, one for the method, those of the settings of
     methods, and those of the agent's settings."""
-    choices = Literal[tuple(methods.known())]  # type: ignore[valid-type]
+    choices: Any = Literal[tuple(methods.known())]
     named = Annotated[choices | None, tyro.conf.arg(help=method_summary())]
     chooses = dataclasses.make_dataclass(
         "transfer", [("method", named, dataclasses.field(default=None))], frozen=True
     )
     chooses.__doc__ = "How knowledge is transferred from a trained agent, if at all."
-    groups = {"run": Run, "transfer": chooses, **method_groups(), "config": Config}
-    fields = [(name, tyro.conf.OmitArgPrefixes[kind]) for name, kind in groups.items()]
+    groups: dict[str, Any] = {"run": Run, "transfer": chooses, **method_groups(), "config": Config}
+    without_prefix: Any = tyro.conf.OmitArgPrefixes
+    fields = [(name, without_prefix[kind]) for name, kind in groups.items()]
     found = dataclasses.make_dataclass("TrainOptions", fields, frozen=True)
     found.__doc__ = inspect.getdoc(Train)
     return found
@@ -307,7 +308,7 @@ def classify(command: Classify) -> int:
     from experiments.runs.agents import load_source
     from experiments.runs.trust import check_trust
 
-    request = {
+    request: dict[str, Any] = {
         "samples": command.samples,
         "neighbours": command.neighbours,
         "quantile": command.quantile,
