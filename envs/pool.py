@@ -209,9 +209,9 @@ class SimulatorPool:
         was interrupted, are passed over.
 
         Args:
-            asked: of each worker asked, the slots, in the order in which it does them.
-            timeout: seconds for which to wait.
-            patience: seconds after which to warn first, by default a few.
+          asked: of each worker asked, the slots, in the order in which it does them.
+          timeout: seconds for which to wait.
+          patience: seconds after which to warn first, by default a few.
         """
         pending = {self._workers[index].connection: index for index in asked}
         failures, error = [], None
