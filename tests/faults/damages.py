@@ -20,6 +20,7 @@ from dreamer_jax.config import preset
 from dreamer_jax.integrity import DamagedError, write_sealed_json
 from dreamer_jax.records import Records
 from dreamer_jax.run_folder import RunFolder
+from dreamer_jax.schema import COUNTERS
 from experiments.reports.outcomes import read_run
 from experiments.runs.folder import read_cells
 from experiments.runs.spec import RunSpec, read_spec
@@ -63,6 +64,8 @@ def go_on(directory: Path, phases: int, every: int = 1) -> None:
     then, all functions of the number of the phase."""
     folder = RunFolder(directory, lock=None, resume=True, layout=LAYOUT)
     found = folder.restore(state(0))
+    if found is None:  # as a training does, so that nothing is ever without a checkpoint
+        folder.save(0, state(0), dict.fromkeys(COUNTERS, 0))
     for number in range(found[1]["rounds"] if found else 0, phases):
         chance, shape = np.random.default_rng(number), (2, 1, 21)
         folder.replay.append(
