@@ -43,6 +43,7 @@ def cpu_seconds(*arguments, folder=ROOT, code=0):
         (["train", "--help"], 0, "config.network options"),
         (["train", "--omeega", "1"], 2, "--omeega"),
         (["train", "--preset", "cpuu", "--help"], 2, "did you mean 'cpu'"),
+        (["train", "--task", "bullet/hoper", "--out", "x"], 2, "Did you mean bullet/hopper"),
         (["table", "99"], 2, "unknown table '99': choose from 1 to 17"),
     ],
 )

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-import envs
 from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.ranges import setting
@@ -195,9 +194,9 @@ class Verify:
 
 def train(command: Train) -> int:
     """Trains a population."""
+    import envs
     from experiments.cli.reports import Report, report
     from experiments.runs.spec import RunSpec
-    from experiments.runs.trust import check_trust, is_of_another
 
     run = command.run
     if run.from_checkpoint == "list":
@@ -210,6 +209,9 @@ def train(command: Train) -> int:
         method = make_method(command.method, command.transfer)
         spec = RunSpec(run.task, run.seeds, command.config, method)
         envs.specs(spec.tasks)
+    from experiments.runs.trust import check_trust, is_of_another
+
+    with usage_errors():
         check_trust([*method.sources, *method.stored], run.trust)
         if is_of_another(run.out):
             check_trust([run.out], run.trust)
