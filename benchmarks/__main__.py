@@ -28,6 +28,7 @@ COMMANDS = {
     "rollout": "rollout",
     "rollout-brax": f"rollout task={BRAX} P=1,8 image_size=32",
     "rollout-brax-64": f"rollout task={BRAX} P=1,8 image_size=64",
+    "brax": "brax",
     "replay": "replay",
     "transfer": "transfer",
     "streaming": "streaming",

@@ -3,13 +3,14 @@
     python -m benchmarks.brax [task=brax/hopper,...] [P=1,8] [image_size=32,64] [steps=100]
                               [repetitions=3]
 
-Prints one line of JSON for each task and P. Processor time is that of this process and of the one
-that draws for MuJoCo, so that what else the machine does matters little. It is read in parts, in
-turns: a rollout with rays at the first size ("physics" is what is left of it without pictures),
-as many pictures by rays alone, and as many by MuJoCo through the host callback alone. Processor
-times add up, so a rollout is its physics and its pictures; "ratio" is that with MuJoCo over that
-with rays, "drawing" the share of rays in the latter. "compile" and "trace" are processor seconds
-too, of the rollout's program. The least of the repetitions counts.
+Prints one line of JSON (and each result as it is known to the standard error). Processor time is
+that of this process and of the one that draws for MuJoCo, so that what else the machine does
+matters little. It is read in parts, in turns: a rollout with rays at the first size ("physics" is
+what is left of it without pictures), as many pictures by rays alone, and as many by MuJoCo through
+the host callback alone. Processor times add up, so a rollout is its physics and its pictures;
+"ratio" is that with MuJoCo over that with rays, "drawing" the share of rays in the latter.
+"compile" and "trace" are processor seconds too, of the rollout's program. The least of the
+repetitions counts.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def rows(name: str, populations, sizes, steps: int, repetitions: int):
         # The first of each warms up.
         least = {part: min(seconds[1:]) / (steps * members) for part, seconds in found.items()}
         physics = least["rollout", sizes[0]] - least["rays", sizes[0]]
-        row = {"benchmark": "brax", "task": name, "P": members, "steps": steps}
+        row = {"task": name, "P": members}
         row |= {"trace": round(traced, 1), "compile": round(compiled, 1)}
         row["physics_ms"] = round(1000 * physics, 4)
         for size in sizes:
@@ -143,11 +144,14 @@ def main(arguments: list[str]) -> None:
     populations, sizes = (
         [int(number) for number in settings[name].split(",")] for name in ("P", "image_size")
     )
+    steps, repetitions = int(settings["steps"]), int(settings["repetitions"])
+    results = []
     for name in settings["task"].split(","):
-        for row in rows(
-            name, populations, sizes, int(settings["steps"]), int(settings["repetitions"])
-        ):
-            print(json.dumps(row), flush=True)
+        for row in rows(name, populations, sizes, steps, repetitions):
+            print(json.dumps(row), file=sys.stderr, flush=True)
+            results.append(row)
+    unit = "agent steps per processor second"
+    print(json.dumps({"benchmark": "brax", "unit": unit, "steps": steps, "results": results}))
 
 
 if __name__ == "__main__":

@@ -40,9 +40,9 @@ class Checkpointer:
     """The checkpoints of one run, newest last.
 
     Args:
-        directory: the folder that holds them; made by the first `save`.
-        keep: how many of the newest are kept. With 2, one that the disk damaged costs the steps
-            since the one before it, not the run.
+      directory: the folder that holds them; made by the first `save`.
+      keep: how many of the newest are kept. With 2, one that the disk damaged costs the steps
+        since the one before it, not the run.
     """
 
     def __init__(self, directory: str | os.PathLike, keep: int = 2):
@@ -73,13 +73,13 @@ class Checkpointer:
         this one replaces.
 
         Args:
-            step: a count that grows during the run.
-            state: pytree of JAX or NumPy arrays, scalars and typed PRNG keys.
-            metadata: what JSON can hold, and NumPy scalars and arrays (stored as lists).
+          step: a count that grows during the run.
+          state: pytree of JAX or NumPy arrays, scalars and typed PRNG keys.
+          metadata: what JSON can hold, and NumPy scalars and arrays (stored as lists).
 
         Raises:
-            OSError: the disk is full or not writable. The earlier checkpoints are untouched.
-            ValueError: two leaves have the same path, or metadata holds NaN.
+          OSError: the disk is full or not writable. The earlier checkpoints are untouched.
+          ValueError: two leaves have the same path, or metadata holds NaN.
         """
         target = self.path(step)
         temporary = target.with_name(target.name + _TEMPORARY)
@@ -132,11 +132,11 @@ class Checkpointer:
         """Compares a checkpoint's files with their checksums.
 
         Returns:
-            Whether it has any; one of an earlier version has none.
+          Whether it has any; one of an earlier version has none.
 
         Raises:
-            FileNotFoundError: there is no checkpoint of that step.
-            CorruptCheckpointError: a file is missing or is not what was written.
+          FileNotFoundError: there is no checkpoint of that step.
+          CorruptCheckpointError: a file is missing or is not what was written.
         """
         return _check(self.path(self._existing(step)))
 
@@ -144,19 +144,19 @@ class Checkpointer:
         """Read a checkpoint back.
 
         Args:
-            template: pytree of arrays or `jax.ShapeDtypeStruct` (as `jax.eval_shape` gives) with
-                the structure, shapes and dtypes of the saved state. Arrays committed to devices
-                are restored to the same devices.
-            step: which one; by default the newest that can be read, with a warning for each that
-                cannot.
+          template: pytree of arrays or `jax.ShapeDtypeStruct` (as `jax.eval_shape` gives) with
+            the structure, shapes and dtypes of the saved state. Arrays committed to devices
+            are restored to the same devices.
+          step: which one; by default the newest that can be read, with a warning for each that
+            cannot.
 
         Returns:
-            state, metadata and step.
+          state, metadata and step.
 
         Raises:
-            FileNotFoundError: there is no checkpoint, or none of that step.
-            ValueError: the template does not fit the checkpoint; names the leaves and both sides.
-            CorruptCheckpointError: `step`, or every checkpoint there is, is damaged.
+          FileNotFoundError: there is no checkpoint, or none of that step.
+          ValueError: the template does not fit the checkpoint; names the leaves and both sides.
+          CorruptCheckpointError: `step`, or every checkpoint there is, is damaged.
         """
         candidates = [self._existing(step)] if step is not None else self.steps()[::-1]
         self._existing(step)
@@ -214,14 +214,14 @@ def load_tree(directory: str | os.PathLike, subtree: str = "") -> dict[str, Any]
     typed PRNG keys become their uint32 data.
 
     Args:
-        directory: a folder of checkpoints (the newest that can be read is used, with a warning
-            for each that cannot) or one checkpoint in it.
-        subtree: path such as "params/encoder"; only what lies under it is read.
+      directory: a folder of checkpoints (the newest that can be read is used, with a warning
+        for each that cannot) or one checkpoint in it.
+      subtree: path such as "params/encoder"; only what lies under it is read.
 
     Raises:
-        FileNotFoundError: no checkpoint is there.
-        KeyError: nothing lies under `subtree`; names what there is at that level.
-        CorruptCheckpointError: the checkpoint is damaged.
+      FileNotFoundError: no checkpoint is there.
+      KeyError: nothing lies under `subtree`; names what there is at that level.
+      CorruptCheckpointError: the checkpoint is damaged.
     """
     directory = Path(directory)
     if _STEP.match(directory.name):

@@ -291,11 +291,11 @@ def _presets() -> dict[str, Config]:
             exploration=explores,
             schedule=ScheduleConfig(
                 supersample=4,
-                environment_steps=10_000,
-                prefill_phases=2,
-                updates_per_phase=20,
+                environment_steps=8000,
+                prefill_phases=3,
+                updates_per_phase=100,
                 evaluate_every=1000,
-                checkpoint_every=5000,
+                checkpoint_every=4000,
             ),
         ),
         "debug": Config(

@@ -28,6 +28,7 @@ from dreamer_jax.replay import Replay
 from dreamer_jax.rollout import collect
 from dreamer_jax.sampling import sample_indices
 from dreamer_jax.schedule import Schedule
+from dreamer_jax.waiting import to_host
 
 AUTOMATIC_SHARE = 0.5
 """Share of an accelerator's memory that a replay may take without being asked for."""
@@ -236,7 +237,7 @@ class DeviceRounds:
                 mapping=schedule.mapping,
                 chunk=schedule.mapping_chunk,
             )
-            records = records.map(np.asarray)
+            records = to_host(records)
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise

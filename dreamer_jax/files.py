@@ -14,8 +14,8 @@ def write_json_atomically(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as JSON so that `path` holds either the old content or the new one, whole.
 
     Raises:
-        ValueError: `value` holds NaN or an infinity, which JSON has no words for.
-        OSError: the disk is full or not writable.
+      ValueError: `value` holds NaN or an infinity, which JSON has no words for.
+      OSError: the disk is full or not writable.
     """
     path = Path(path)
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
@@ -54,10 +54,10 @@ def explained(error: OSError, what: str, path: str | os.PathLike, advice: str = 
     """`error` again, of the same kind, saying what failed, where, and the way out.
 
     Args:
-        error: what the system reported.
-        what: failed, with its name.
-        path: a place on the disk that was written to.
-        advice: what has become of everything else.
+      error: what the system reported.
+      what: failed, with its name.
+      path: a place on the disk that was written to.
+      advice: what has become of everything else.
     """
     reason = error.strerror or str(error)
     if error.errno in (errno.EMFILE, errno.ENFILE):

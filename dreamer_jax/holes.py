@@ -14,7 +14,7 @@ def free_beginning(path: Path, size: int) -> None:
     """Free the disk blocks of a file's first `size` bytes, which are zeros from then on.
 
     Raises:
-        OSError: among others with ENOTSUP, where the system or the file system cannot do it.
+      OSError: among others with ENOTSUP, where the system or the file system cannot do it.
     """
     fallocate = getattr(ctypes.CDLL(None, use_errno=True), "fallocate", None)
     if fallocate is None:

@@ -55,7 +55,7 @@ def read_sealed_json(path: str | os.PathLike) -> Any:
     """The value in a JSON file, an object's checksum taken off; without one it is not checked.
 
     Raises:
-        DamagedError: it is not JSON, or not what was written.
+      DamagedError: it is not JSON, or not what was written.
     """
     try:
         values = read_json(path)
@@ -99,15 +99,15 @@ def check_files(folder: Path, names: Iterable[str] | None = None) -> str | None:
     """Compares files with the checksums beside them.
 
     Args:
-        folder: holds the files, and checksums.json.
-        names: which files; by default all that checksums.json lists.
+      folder: holds the files, and checksums.json.
+      names: which files; by default all that checksums.json lists.
 
     Returns:
-        What is wrong with the first file that is missing or is not what was written; None if there
-        is nothing.
+      What is wrong with the first file that is missing or is not what was written; None if there
+      is nothing.
 
     Raises:
-        FileNotFoundError: there is no checksums.json.
+      FileNotFoundError: there is no checksums.json.
     """
     try:
         table = read_json(folder / CHECKSUMS)["files"]

@@ -24,7 +24,7 @@ class FolderInUseError(ValueError):
     """Another process works in the folder.
 
     Attributes:
-        holder: which one, in words.
+      holder: which one, in words.
     """
 
     def __init__(self, directory: Path, holder: str):
@@ -41,13 +41,13 @@ class FolderLock:
     A context manager too. A second lock of the same name in one process is refused like any other.
 
     Args:
-        directory: the folder; made if absent.
-        name: of the lock's file. Work that does not disturb other work has a lock of its own.
+      directory: the folder; made if absent.
+      name: of the lock's file. Work that does not disturb other work has a lock of its own.
 
     Raises:
-        FolderInUseError: another process (named, with its host and since when) holds it.
-        NotADirectoryError: there is a file in the folder's place.
-        OSError: the folder cannot be written.
+      FolderInUseError: another process (named, with its host and since when) holds it.
+      NotADirectoryError: there is a file in the folder's place.
+      OSError: the folder cannot be written.
     """
 
     def __init__(self, directory: str | os.PathLike, name: str = ".lock"):

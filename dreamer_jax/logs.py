@@ -42,8 +42,8 @@ class MetricsWriter:
     none. A file opened again is appended to; a half-written last line is dropped.
 
     Args:
-        directory: the folder; made if absent.
-        tensorboard: whether to write TensorBoard's files too.
+      directory: the folder; made if absent.
+      tensorboard: whether to write TensorBoard's files too.
     """
 
     def __init__(self, directory: str | os.PathLike, tensorboard: bool = True):
@@ -60,9 +60,9 @@ class MetricsWriter:
         """Add a row.
 
         Raises:
-            ValueError: `kind`, `member` or `env_steps` is missing.
-            TypeError: a value is not a number, a string, a truth value or None.
-            OSError: the disk is full or not writable; the file keeps its whole lines.
+          ValueError: `kind`, `member` or `env_steps` is missing.
+          TypeError: a value is not a number, a string, a truth value or None.
+          OSError: the disk is full or not writable; the file keeps its whole lines.
         """
         missing = [name for name in ("kind", "member", "env_steps") if name not in row]
         if missing:
@@ -93,11 +93,11 @@ class MetricsWriter:
         """Whether the file holds the rows that a checkpoint committed.
 
         Args:
-            offset: size of the rows in bytes.
-            checksum: their CRC-32; None of a checkpoint that has none.
+          offset: size of the rows in bytes.
+          checksum: their CRC-32; None of a checkpoint that has none.
 
         Raises:
-            DamagedError: it does not.
+          DamagedError: it does not.
         """
         self._metrics.check(offset, checksum)
 
@@ -105,7 +105,7 @@ class MetricsWriter:
         """Drop the rows beyond a committed offset (0: all rows), in TensorBoard's view too.
 
         Raises:
-            DamagedError: the file is shorter than that, or the offset is not the end of a line.
+          DamagedError: the file is shorter than that, or the offset is not the end of a line.
         """
         self._metrics.truncate(offset)
         if self._tensorboard:
@@ -136,8 +136,8 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
     A half-written last line is left out.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a line before the last is not JSON; names the file and the line.
+      FileNotFoundError: there is no such file.
+      ValueError: a line before the last is not JSON; names the file and the line.
     """
     path = Path(path)
     if path.is_dir():

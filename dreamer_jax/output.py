@@ -15,7 +15,7 @@ class SafeStream:
     by `| head -1`), or the disk of a log is full, everything from then on is lost.
 
     Args:
-        stream: where to write.
+      stream: where to write.
     """
 
     def __init__(self, stream: TextIO):

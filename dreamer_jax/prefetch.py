@@ -17,9 +17,9 @@ class Prefetcher(Generic[Prepared]):
     An exception in `prepare` is raised by the `next` that would have returned its result.
 
     Args:
-        prepare: called in the background thread, one item at a time, in order.
-        items: what to prepare, e.g. the numbers of the updates of a round.
-        depth: how many results are prepared ahead at most.
+      prepare: called in the background thread, one item at a time, in order.
+      items: what to prepare, e.g. the numbers of the updates of a round.
+      depth: how many results are prepared ahead at most.
     """
 
     def __init__(self, prepare: Callable[[int], Prepared], items: Iterable[int], depth: int = 2):

@@ -59,13 +59,13 @@ class Progress:
     nobody reads what it says.
 
     Args:
-        total_env_steps: environment steps of the whole run.
-        total_updates: updates of the whole run; 0 if it makes none.
-        env_steps: environment steps made before (by the part of the run that is now resumed).
-        updates: updates made before.
-        description: shown in front.
-        stream: where to write; standard output by default.
-        interval: seconds between plain lines, where the stream is not a terminal.
+      total_env_steps: environment steps of the whole run.
+      total_updates: updates of the whole run; 0 if it makes none.
+      env_steps: environment steps made before (by the part of the run that is now resumed).
+      updates: updates made before.
+      description: shown in front.
+      stream: where to write; standard output by default.
+      interval: seconds between plain lines, where the stream is not a terminal.
     """
 
     def __init__(
@@ -99,10 +99,10 @@ class Progress:
         """Say what is new; what is left out stays as it was.
 
         Args:
-            env_steps: environment steps made so far, in all.
-            updates: updates made so far, in all.
-            phase: what begins now, e.g. "collecting".
-            last_return: return of the newest episodes (of a population, their mean).
+          env_steps: environment steps made so far, in all.
+          updates: updates made so far, in all.
+          phase: what begins now, e.g. "collecting".
+          last_return: return of the newest episodes (of a population, their mean).
         """
         if phase is not None:
             self._phase = phase

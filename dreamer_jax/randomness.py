@@ -69,6 +69,15 @@ def diagnosis_key(seed: jax.Array, phase: jax.Array, task: jax.Array | int) -> j
     return jax.random.fold_in(jax.random.fold_in(member_key(seed, Purpose.DIAGNOSE), phase), task)
 
 
+def latent_key(seed: int, phase: int, task: int) -> jax.Array:
+    """The key of the posterior's samples where latent states are inferred after a training.
+
+    It may be the key of an update, or of a component at the start: nothing is drawn from those
+    themselves, only from keys that derive from them.
+    """
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), phase), task)
+
+
 def hold_key(key: jax.Array) -> jax.Array:
     """A key to draw from beside `key`: it decides whether what was held before is kept.
 

@@ -67,16 +67,16 @@ class Replay:
     overwritten by the next `append`.
 
     Args:
-        directory: the folder; made if absent.
-        members: P.
-        tasks: K.
-        image_size: height and width of the images.
-        action_size: A.
-        keep: sample only from the newest `keep` records of each stream; None for all. The others
-            stay on the disk until `delete` is called.
+      directory: the folder; made if absent.
+      members: P.
+      tasks: K.
+      image_size: height and width of the images.
+      action_size: A.
+      keep: sample only from the newest `keep` records of each stream; None for all. The others
+        stay on the disk until `delete` is called.
 
     Raises:
-        ValueError: the folder holds a replay of another layout, or `keep` is less than 1.
+      ValueError: the folder holds a replay of another layout, or `keep` is less than 1.
     """
 
     def __init__(
@@ -198,11 +198,11 @@ class Replay:
         Either all streams grow by T records or, if this raises, none does.
 
         Args:
-            records: leaves [P, K, T, ...].
+          records: leaves [P, K, T, ...].
 
         Raises:
-            ValueError: a shape or dtype is not that of the layout.
-            OSError: the disk is full or not writable; names the file and the free space.
+          ValueError: a shape or dtype is not that of the layout.
+          OSError: the disk is full or not writable; names the file and the free space.
         """
         records = self._checked(records)
         steps = records.reward.shape[2]
@@ -282,11 +282,11 @@ class Replay:
         """Whether the streams can be cut back to what a checkpoint committed.
 
         Args:
-            lengths: integers [P, K].
-            checksums: of the streams at these lengths; None of a checkpoint that has none.
+          lengths: integers [P, K].
+          checksums: of the streams at these lengths; None of a checkpoint that has none.
 
         Raises:
-            ValueError: see `truncate`; a `DamagedError` if the streams' checksums are others.
+          ValueError: see `truncate`; a `DamagedError` if the streams' checksums are others.
         """
         lengths = np.asarray(lengths, np.int64)
         if lengths.shape != self._lengths.shape:
@@ -318,11 +318,11 @@ class Replay:
         """Cut every stream back to the lengths that a checkpoint committed.
 
         Args:
-            lengths: integers [P, K].
+          lengths: integers [P, K].
 
         Raises:
-            ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
-                that would be sampled at these lengths are deleted; nothing is cut then.
+          ValueError: the shape is wrong, or a stream holds fewer records than asked for, or some
+            that would be sampled at these lengths are deleted; nothing is cut then.
         """
         self.check(lengths)
         lengths = np.asarray(lengths, np.int64)
@@ -334,7 +334,7 @@ class Replay:
         """Compares the first `length` records of a stream, but for deleted ones, with checksums.
 
         Returns:
-            What is wrong, if anything; and how many of the records have no checksum.
+          What is wrong, if anything; and how many of the records have no checksum.
         """
         checksums, deleted = self._checksums[member, task], int(self._deleted[member, task])
         try:
@@ -358,8 +358,8 @@ class Replay:
         a file nothing is deleted, and a warning says so.
 
         Args:
-            lengths: integers [P, K], such as those of the oldest checkpoint to which a run may
-                have to go back.
+          lengths: integers [P, K], such as those of the oldest checkpoint to which a run may
+            have to go back.
         """
         lengths = np.minimum(np.asarray(lengths, np.int64), self._lengths)
         deleted = np.maximum(self._deleted, self._oldest_sampled(lengths))
@@ -387,7 +387,7 @@ class Replay:
         """A copy of the records [start, stop) of one stream, leaves [stop - start, ...].
 
         Raises:
-            ValueError: the range is not within the committed records that are not deleted.
+          ValueError: the range is not within the committed records that are not deleted.
         """
         oldest, held = int(self._deleted[member, task]), int(self._lengths[member, task])
         if not oldest <= start <= stop <= held:
@@ -418,20 +418,20 @@ class Replay:
         (see `sample_indices`). Sequences stay within a stream and may cross an episode's end.
 
         Args:
-            seeds: [P], one for each of `members`.
-            update: number of the update.
-            batch: B.
-            length: L.
-            members: which members, in the order of the result; all by default.
-            lengths: [P, K] sample as when the streams had these lengths (at most the committed
-                ones, which are the default).
+          seeds: [P], one for each of `members`.
+          update: number of the update.
+          batch: B.
+          length: L.
+          members: which members, in the order of the result; all by default.
+          lengths: [P, K] sample as when the streams had these lengths (at most the committed
+            ones, which are the default).
 
         Returns:
-            Leaves [P, B, L, ...]. The arrays are new and never written again: on the CPU, JAX
-            may use their memory without a copy.
+          Leaves [P, B, L, ...]. The arrays are new and never written again: on the CPU, JAX
+          may use their memory without a copy.
 
         Raises:
-            ValueError: no stream of a member holds L records, or arguments do not fit together.
+          ValueError: no stream of a member holds L records, or arguments do not fit together.
         """
         members = range(self.members) if members is None else list(members)
         if len(seeds) != len(members):

@@ -27,19 +27,19 @@ def sample_indices(
     lengths, then a start uniformly among the starts that keep the sequence inside the stream.
 
     Args:
-        seed: the member's seed, not negative.
-        update: the number of the update, not negative.
-        lengths: [K] records in each of the member's streams.
-        batch: B.
-        length: L.
-        keep: only the newest `keep` records of each stream are sampled; None for all.
-        deleted: [K] records at the beginning of each stream that are there no more; none given: 0.
+      seed: the member's seed, not negative.
+      update: the number of the update, not negative.
+      lengths: [K] records in each of the member's streams.
+      batch: B.
+      length: L.
+      keep: only the newest `keep` records of each stream are sampled; None for all.
+      deleted: [K] records at the beginning of each stream that are there no more; none given: 0.
 
     Returns:
-        tasks int64 [B] and starts int64 [B], starts counted from the first record of the stream.
+      tasks int64 [B] and starts int64 [B], starts counted from the first record of the stream.
 
     Raises:
-        ValueError: no stream holds L records (within `keep`, and not deleted).
+      ValueError: no stream holds L records (within `keep`, and not deleted).
     """
     if batch < 1 or length < 1:
         raise ValueError(f"batch and length must be at least 1, got {batch} and {length}")

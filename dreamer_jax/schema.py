@@ -64,12 +64,12 @@ def check_shape(value: Any, shape: Any, file: Any) -> Any:
     """The value, if it has the shape.
 
     Args:
-        value: what was read.
-        shape: see above.
-        file: where from, for the message.
+      value: what was read.
+      shape: see above.
+      file: where from, for the message.
 
     Raises:
-        DamagedError: it has not; names the file, the place in it, and what was expected there.
+      DamagedError: it has not; names the file, the place in it, and what was expected there.
     """
     if problem := _problem(value, shape, ""):
         raise DamagedError(f"{file} is not what this program writes: {problem}")

@@ -53,8 +53,8 @@ def write_tree(folder: Path, tree: Any) -> None:
     """Write a pytree of arrays, scalars and typed PRNG keys into a folder that exists.
 
     Raises:
-        ValueError: two leaves have the same path.
-        OSError: the disk is full or not writable.
+      ValueError: two leaves have the same path.
+      OSError: the disk is full or not writable.
     """
     paths_and_leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     table, values = [], {}
@@ -92,8 +92,8 @@ def read_tree(folder: Path, template: Tree) -> Tree:
     """The pytree in a folder, with the structure of the template and on its devices.
 
     Raises:
-        ValueError: structure, shapes or dtypes differ from the template's.
-        CorruptCheckpointError: the tree is not there as it was written.
+      ValueError: structure, shapes or dtypes differ from the template's.
+      CorruptCheckpointError: the tree is not there as it was written.
     """
     paths_and_leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     table = _read_table(folder)
@@ -117,8 +117,8 @@ def read_subtree(folder: Path, subtree: str) -> Any:
     """The arrays under a path such as "params/encoder": nested dicts of NumPy arrays.
 
     Raises:
-        KeyError: nothing lies there; names what there is at the level where the path ends.
-        CorruptCheckpointError: it is not there as it was written.
+      KeyError: nothing lies there; names what there is at the level where the path ends.
+      CorruptCheckpointError: it is not there as it was written.
     """
     prefix = tuple(part for part in subtree.split("/") if part)
     table = _read_table(folder)

@@ -26,8 +26,8 @@ class StreamChecksums:
     Pieces that this object has found sound, or has written, are not read again.
 
     Args:
-        records: the file of records; the entries are in a file of that name with `.checksums`.
-        item_size: bytes of a record.
+      records: the file of records; the entries are in a file of that name with `.checksums`.
+      item_size: bytes of a record.
     """
 
     def __init__(self, records: Path, item_size: int):
@@ -74,7 +74,7 @@ class StreamChecksums:
         """Make the entries those of the first `length` records of the file, which holds them.
 
         Raises:
-            DamagedError: `length` is within a piece that is not what was written.
+          DamagedError: `length` is within a piece that is not what was written.
         """
         if length < self.end:
             self.split(length)
@@ -89,7 +89,7 @@ class StreamChecksums:
         """Let a piece end at `length` and the next one begin, so that each can be checked alone.
 
         Raises:
-            DamagedError: the piece is not what was written.
+          DamagedError: the piece is not what was written.
         """
         number = int(np.searchsorted(self._entries["end"], length))
         if not 0 < length < self.end or self._entries["end"][number] == length:
@@ -128,7 +128,7 @@ class StreamChecksums:
         """Whether the entries up to `length` are those that a checkpoint committed.
 
         Raises:
-            DamagedError: they are not.
+          DamagedError: they are not.
         """
         held = self._entries["checksum"][self._entries["end"] == length]
         if length and (not len(held) or held[0] != checksum):
@@ -141,7 +141,7 @@ class StreamChecksums:
         """Reads a piece and compares it with its checksum, unless that was done before.
 
         Raises:
-            DamagedError: it is not what was written; names the file and the records.
+          DamagedError: it is not what was written; names the file and the records.
         """
         if self._sound[number]:
             return

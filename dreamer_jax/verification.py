@@ -26,9 +26,9 @@ class Finding(NamedTuple):
     """What was found of one part of a folder.
 
     Attributes:
-        part: such as "replay".
-        state: "sound" (compared with checksums), "damaged", or "unchecked" (there are none).
-        text: what was compared, or what is wrong.
+      part: such as "replay".
+      state: "sound" (compared with checksums), "damaged", or "unchecked" (there are none).
+      text: what was compared, or what is wrong.
     """
 
     part: str

@@ -20,17 +20,17 @@ def write_video(path: str | os.PathLike, frames: np.ndarray, fps: float = 25.0) 
     """Write frames as a video; small ones enlarged by a whole factor, pixels staying squares.
 
     Args:
-        path: ends in .mp4 (H.264) or .gif; its folder is made if absent.
-        frames: uint8 [T, height, width, 3].
-        fps: frames per second.
+      path: ends in .mp4 (H.264) or .gif; its folder is made if absent.
+      frames: uint8 [T, height, width, 3].
+      fps: frames per second.
 
     Returns:
-        the path.
+      the path.
 
     Raises:
-        ValueError: the frames have another shape or dtype, there are none, or the suffix is
-            another.
-        OSError: the file cannot be written; with the reason.
+      ValueError: the frames have another shape or dtype, there are none, or the suffix is
+        another.
+      OSError: the file cannot be written; with the reason.
     """
     path = Path(path)
     frames = np.asarray(frames)
@@ -74,15 +74,15 @@ def captioned(videos: np.ndarray, captions: Sequence[str], border: int = 8) -> n
     """Videos side by side, enlarged, each with its caption above it: black on white.
 
     Args:
-        videos: uint8 [N, T, height, width, 3].
-        captions: one for each video, in Latin letters; a line break begins a new line.
-        border: white pixels around every video.
+      videos: uint8 [N, T, height, width, 3].
+      captions: one for each video, in Latin letters; a line break begins a new line.
+      border: white pixels around every video.
 
     Returns:
-        uint8 [T, taller, wider, 3].
+      uint8 [T, taller, wider, 3].
 
     Raises:
-        ValueError: the videos have another shape, or there are more or fewer captions.
+      ValueError: the videos have another shape, or there are more or fewer captions.
     """
     from PIL import Image, ImageDraw, ImageFont
 

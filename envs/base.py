@@ -18,21 +18,21 @@ class TaskSpec:
     """What is known of a task without making a simulator of it.
 
     Attributes:
-        name: the name in this package, `backend/task`, such as "bullet/hopper".
-        title: the name as it is printed, such as "Hopper".
-        action_size: |A|, the number of continuous actions, each in [-1, 1], or of choices.
-        simulator: where to find its `Simulator`, as "module:callable"; it is called with
-            (title, image_size).
-        gymnasium_id: the id under which `gymnasium.make` finds the same task.
-        action_repeat: environment steps for which one action is held, unless told otherwise.
-        time_limit: length of an episode in environment steps (not in actions).
-        step_seconds: simulated time of one environment step, in seconds.
-        discrete: whether an action is one of |A| choices, given as a one-hot vector.
-        physics: the physics engine, of a backend that has several.
-        levels: known returns of whole episodes of `time_limit` environment steps, as pairs of what
-            was done and the return it brought, measured on this simulator.
-        supersample: pictures are drawn this many times as large, and averaged down.
-        renderer: what draws the pictures, of a backend that has several renderers.
+      name: the name in this package, `backend/task`, such as "bullet/hopper".
+      title: the name as it is printed, such as "Hopper".
+      action_size: |A|, the number of continuous actions, each in [-1, 1], or of choices.
+      simulator: where to find its `Simulator`, as "module:callable"; it is called with
+        (title, image_size).
+      gymnasium_id: the id under which `gymnasium.make` finds the same task.
+      action_repeat: environment steps for which one action is held, unless told otherwise.
+      time_limit: length of an episode in environment steps (not in actions).
+      step_seconds: simulated time of one environment step, in seconds.
+      discrete: whether an action is one of |A| choices, given as a one-hot vector.
+      physics: the physics engine, of a backend that has several.
+      levels: known returns of whole episodes of `time_limit` environment steps, as pairs of what
+        was done and the return it brought, measured on this simulator.
+      supersample: pictures are drawn this many times as large, and averaged down.
+      renderer: what draws the pictures, of a backend that has several renderers.
     """
 
     name: str
@@ -59,10 +59,10 @@ class TimeStep(NamedTuple):
     """What one tick of an environment gives. Every leaf gets the leading axes of a `vmap`.
 
     Attributes:
-        image: uint8 [height, width, 3], after the tick.
-        reward: float32 [], summed over the action repeat; 0 on a reset.
-        first: bool [], True if this tick was a reset.
-        terminal: bool [], True if the episode ended by itself; never by a time limit.
+      image: uint8 [height, width, 3], after the tick.
+      reward: float32 [], summed over the action repeat; 0 on a reset.
+      first: bool [], True if this tick was a reset.
+      terminal: bool [], True if the episode ended by itself; never by a time limit.
     """
 
     image: Any
@@ -82,11 +82,11 @@ class Env(Protocol):
     `reset`. Everything from one `reset` to the next is a function of its key and the actions alone.
 
     Attributes:
-        action_size: A, the largest |A| of the tasks; smaller tasks read their first |A| entries.
-        image_size: height and width of the images in pixels.
-        discrete: True if actions are one-hot vectors of length A; False for continuous ones.
-        has_host: False if all of it is part of the jitted program; True if anything, simulators or
-            renderers, runs on the host.
+      action_size: A, the largest |A| of the tasks; smaller tasks read their first |A| entries.
+      image_size: height and width of the images in pixels.
+      discrete: True if actions are one-hot vectors of length A; False for continuous ones.
+      has_host: False if all of it is part of the jitted program; True if anything, simulators or
+        renderers, runs on the host.
     """
 
     action_size: int

@@ -22,12 +22,12 @@ class Places(NamedTuple):
     """Where things are.
 
     Attributes:
-        positions: of links, float32 [n, L, 3].
-        quaternions: of links, float32 [n, L, 4].
-        rotations: of links, float32 [n, L, 3, 3].
-        axes: of degrees of freedom, float32 [n, D, 3]: what one unit of velocity turns about.
-        slides: float32 [n, D, 3]: along what it moves.
-        anchors: float32 [n, D, 3]: a point on each axis.
+      positions: of links, float32 [n, L, 3].
+      quaternions: of links, float32 [n, L, 4].
+      rotations: of links, float32 [n, L, 3, 3].
+      axes: of degrees of freedom, float32 [n, D, 3]: what one unit of velocity turns about.
+      slides: float32 [n, D, 3]: along what it moves.
+      anchors: float32 [n, D, 3]: a point on each axis.
     """
 
     positions: jax.Array
@@ -42,13 +42,13 @@ class Motions(NamedTuple):
     """Inertia and motion about the centre of mass of the whole.
 
     Attributes:
-        centre: float32 [n, 3].
-        moments: of links, float32 [n, L, 3]: mass times the centre of mass's place.
-        inertia: of links, float32 [n, L, 3, 3].
-        turns, moves: of degrees of freedom, float32 [n, D, 3]: the angular and linear part of what
-            one unit of velocity does.
-        link_turns, link_moves: of links, float32 [n, L, 3]: their velocity.
-        turns_rate, moves_rate: how turns and moves change, float32 [n, D, 3].
+      centre: float32 [n, 3].
+      moments: of links, float32 [n, L, 3]: mass times the centre of mass's place.
+      inertia: of links, float32 [n, L, 3, 3].
+      turns, moves: of degrees of freedom, float32 [n, D, 3]: the angular and linear part of what
+        one unit of velocity does.
+      link_turns, link_moves: of links, float32 [n, L, 3]: their velocity.
+      turns_rate, moves_rate: how turns and moves change, float32 [n, D, 3].
     """
 
     centre: jax.Array
@@ -66,10 +66,10 @@ class Chain:
     """The tree of a system whose joints are hinges, slides and at most one free joint at its root.
 
     Args:
-        system: a `brax.System`.
+      system: a `brax.System`.
 
     Raises:
-        ValueError: the system is not of that kind.
+      ValueError: the system is not of that kind.
     """
 
     def __init__(self, system):

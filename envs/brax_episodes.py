@@ -28,8 +28,8 @@ class Episodes:
     """Episodes of any physics.
 
     Args:
-        physics: of the task.
-        repeat: environment steps for which an action is held.
+      physics: of the task.
+      repeat: environment steps for which an action is held.
     """
 
     def __init__(self, physics: Physics, repeat: int):
@@ -46,13 +46,13 @@ class Episodes:
         """Hold actions, fewer steps if an episode ends; start another where one has ended.
 
         Args:
-            states: leaves [n, ...].
-            actions: float32 [n, |A|].
-            ended: bool [n], whose episodes ended at the tick before: they start anew instead.
-            keys: n typed keys, of the episodes that would be next.
+          states: leaves [n, ...].
+          actions: float32 [n, |A|].
+          ended: bool [n], whose episodes ended at the tick before: they start anew instead.
+          keys: n typed keys, of the episodes that would be next.
 
         Returns:
-            States, rewards float32 [n] and whether episodes ended, bool [n]; a start has neither.
+          States, rewards float32 [n] and whether episodes ended, bool [n]; a start has neither.
         """
         hold = jax.vmap(lambda state, action: self._physics.hold(state, action, self._repeat))
         moved, rewards, terminal = hold(states, actions)
@@ -71,12 +71,12 @@ class _Held(NamedTuple):
     """States of the generalized engine, as much of each as the next step needs.
 
     Attributes:
-        q: float32 [n, Q], joint positions.
-        qd: float32 [n, D], joint velocities.
-        inverse: float32 [n, D, D], of the mass matrix, as the last step knew it.
-        positions: float32 [n, L, 3], of links.
-        quaternions: float32 [n, L, 4].
-        new: bool [n], no step was made: the inverse is not known.
+      q: float32 [n, Q], joint positions.
+      qd: float32 [n, D], joint velocities.
+      inverse: float32 [n, D, D], of the mass matrix, as the last step knew it.
+      positions: float32 [n, L, 3], of links.
+      quaternions: float32 [n, L, 4].
+      new: bool [n], no step was made: the inverse is not known.
     """
 
     q: jax.Array
@@ -258,10 +258,10 @@ def improved_inverses(matrices, inverses, known: jax.Array, steps: int) -> jax.A
     Brax makes the same steps (Schulz's), and all of them whether or not they change anything.
 
     Args:
-        matrices: symmetric, positive definite.
-        inverses: of matrices near them.
-        known: bool [n], which need no inverse.
-        steps: how many are made at most.
+      matrices: symmetric, positive definite.
+      inverses: of matrices near them.
+      known: bool [n], which need no inverse.
+      steps: how many are made at most.
     """
     identity = jnp.eye(matrices.shape[1])
 

@@ -28,9 +28,9 @@ class _Look:
     """How a task is drawn.
 
     Attributes:
-        file: of Brax's model.
-        colours: of the bodies, in the model's order: those that PyBullet gives them.
-        target: height at which the camera looks; None for that of the first body.
+      file: of Brax's model.
+      colours: of the bodies, in the model's order: those that PyBullet gives them.
+      target: height at which the camera looks; None for that of the first body.
     """
 
     file: str
@@ -71,7 +71,7 @@ def model_xml(title: str) -> str:
     """Brax's model of a task; the pendula's hinges may turn all the way round.
 
     Raises:
-        ModuleNotFoundError: if Brax is not installed.
+      ModuleNotFoundError: if Brax is not installed.
     """
     brax = importlib.util.find_spec("brax")
     if brax is None or not brax.submodule_search_locations:

@@ -103,14 +103,14 @@ class Physics:
     """One task's dynamics as pure functions of Brax's state.
 
     Attributes:
-        action_size: |A|.
-        positions: Q.
-        seconds: simulated time of one `step`.
-        env: Brax's environment.
+      action_size: |A|.
+      positions: Q.
+      seconds: simulated time of one `step`.
+      env: Brax's environment.
 
     Args:
-        title: one of the six names of the thesis, such as "Walker2D".
-        backend: Brax's engine: "generalized", "spring", "positional" or "mjx".
+      title: one of the six names of the thesis, such as "Walker2D".
+      backend: Brax's engine: "generalized", "spring", "positional" or "mjx".
     """
 
     def __init__(self, title: str, backend: str):
@@ -136,8 +136,8 @@ class Physics:
         """Advance by one environment step with `action` (float32 [|A|], clipped to [-1, 1]).
 
         Returns:
-            The state, the reward and whether the episode ended. A state in which the engine
-            has diverged ends it too, without reward, and is replaced by the one before.
+          The state, the reward and whether the episode ended. A state in which the engine
+          has diverged ends it too, without reward, and is replaced by the one before.
         """
         with quiet():
             after = self.env.step(brax_state(state), jnp.clip(action, -1.0, 1.0))

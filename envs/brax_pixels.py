@@ -36,11 +36,11 @@ class BraxState(NamedTuple):
     """The state of one slot.
 
     Attributes:
-        slot: int32 [].
-        key: uint32 [2], of the phase.
-        episode: int32 [], how many episodes of the phase came before.
-        ended: int32 [], whether the next tick starts another.
-        physics: int32 [W], the words of Brax's state.
+      slot: int32 [].
+      key: uint32 [2], of the phase.
+      episode: int32 [], how many episodes of the phase came before.
+      ended: int32 [], whether the next tick starts another.
+      physics: int32 [W], the words of Brax's state.
     """
 
     slot: jax.Array
@@ -57,15 +57,15 @@ class BraxEnv:
     slots of which some are alike where all P * K are stepped at once.
 
     Args:
-        tasks: K tasks; slot s plays tasks[s % K].
-        members: P; there are P * K slots.
-        image_size: height and width of the images in pixels.
-        action_repeat: environment steps for which an action is held.
-        action_size: A, at least the largest |A| of the tasks.
-        workers, timeout: not used.
+      tasks: K tasks; slot s plays tasks[s % K].
+      members: P; there are P * K slots.
+      image_size: height and width of the images in pixels.
+      action_repeat: environment steps for which an action is held.
+      action_size: A, at least the largest |A| of the tasks.
+      workers, timeout: not used.
 
     Raises:
-        ValueError: for an image size that is too small.
+      ValueError: for an image size that is too small.
     """
 
     discrete = False
@@ -195,13 +195,13 @@ class HostDrawnBraxEnv(BraxEnv):
     """An `Env` whose physics is part of the program; worker processes draw the pictures.
 
     Args:
-        tasks, members, image_size, action_repeat, action_size: as of `BraxEnv`.
-        workers: number of processes that draw, by default min(cores, slots).
-        timeout: seconds after which one that does not answer is given up.
+      tasks, members, image_size, action_repeat, action_size: as of `BraxEnv`.
+      workers: number of processes that draw, by default min(cores, slots).
+      timeout: seconds after which one that does not answer is given up.
 
     Raises:
-        ValueError: for an image size that is too small.
-        SimulatorError: if there is nothing to draw with, and what to install.
+      ValueError: for an image size that is too small.
+      SimulatorError: if there is nothing to draw with, and what to install.
     """
 
     has_host = True
@@ -310,14 +310,14 @@ class BraxSimulator:
     """One of the six tasks in this process, one step at a time: for `envs.pixel_env`.
 
     Args:
-        title: one of the six names of the thesis, such as "Walker2D".
-        image_size: height and width of the rendered images in pixels.
-        backend: Brax's engine.
-        renderer: "jax" or "mujoco".
+      title: one of the six names of the thesis, such as "Walker2D".
+      image_size: height and width of the rendered images in pixels.
+      backend: Brax's engine.
+      renderer: "jax" or "mujoco".
 
     Raises:
-        ValueError: for an image size that is too small.
-        SimulatorError: if MuJoCo is to draw and finds no driver.
+      ValueError: for an image size that is too small.
+      SimulatorError: if MuJoCo is to draw and finds no driver.
     """
 
     def __init__(self, title: str, image_size: int, backend: str, renderer: str):

@@ -26,9 +26,9 @@ class Token(NamedTuple):
     """What a jitted program holds in place of a simulator's state.
 
     Attributes:
-        slot: int32 [], which simulator. It must be mapped if anything is.
-        tick: int32 [], how many ticks this slot has made since the environment was built; the
-            host keeps the same count, and a token that was used before is told by it.
+      slot: int32 [], which simulator. It must be mapped if anything is.
+      tick: int32 [], how many ticks this slot has made since the environment was built; the
+        host keeps the same count, and a token that was used before is told by it.
     """
 
     slot: jax.Array
@@ -46,11 +46,11 @@ class HostCalls:
         """A function on the host as one of a single row, in one call however it is mapped.
 
         Args:
-            host: int32 [n, W] -> leaves [n, ...]; never called after an error until `check`.
-            results: tree of `jax.ShapeDtypeStruct`, the results for one row.
+          host: int32 [n, W] -> leaves [n, ...]; never called after an error until `check`.
+          results: tree of `jax.ShapeDtypeStruct`, the results for one row.
 
         Returns:
-            The function of int32 [W]. Map over the row if anything is mapped.
+          The function of int32 [W]. Map over the row if anything is mapped.
         """
 
         def shapes(count):
@@ -94,13 +94,13 @@ class HostEnv:
     """An `Env` over simulators that live in worker processes.
 
     Args:
-        tasks: K tasks, all continuous or all discrete; slot s plays tasks[s % K].
-        members: P; there are P * K slots.
-        image_size: height and width of the images in pixels.
-        action_repeat: environment steps for which an action is held.
-        action_size: A, at least the largest |A| of the tasks.
-        workers: number of worker processes, by default min(cores, slots).
-        timeout: seconds after which a simulator that does not answer is given up.
+      tasks: K tasks, all continuous or all discrete; slot s plays tasks[s % K].
+      members: P; there are P * K slots.
+      image_size: height and width of the images in pixels.
+      action_repeat: environment steps for which an action is held.
+      action_size: A, at least the largest |A| of the tasks.
+      workers: number of worker processes, by default min(cores, slots).
+      timeout: seconds after which a simulator that does not answer is given up.
     """
 
     has_host = True
@@ -152,7 +152,7 @@ class HostEnv:
         """Let slots idle: their images are black and their rewards 0, and no simulator runs.
 
         Args:
-            slots: bool [P * K]; those that are False are simulated from their next reset on.
+          slots: bool [P * K]; those that are False are simulated from their next reset on.
         """
         slots = np.asarray(slots, bool)
         if slots.shape != self._resting.shape:

@@ -93,8 +93,8 @@ class BulletSimulator:
     that this simulator did before.
 
     Args:
-        title: one of the six names of the thesis, such as "Walker2D".
-        image_size: height and width of the rendered images in pixels.
+      title: one of the six names of the thesis, such as "Walker2D".
+      image_size: height and width of the rendered images in pixels.
     """
 
     def __init__(self, title: str, image_size: int):

@@ -26,8 +26,8 @@ class _Traits(NamedTuple):
     """What one look at an environment tells.
 
     Attributes:
-        task: as a task of this package.
-        observes_images: whether its observations are images; otherwise it draws pictures.
+      task: as a task of this package.
+      observes_images: whether its observations are images; otherwise it draws pictures.
     """
 
     task: TaskSpec
@@ -38,10 +38,10 @@ def gymnasium_task(id: str) -> TaskSpec:
     """What is known of the gymnasium environment `id`, which is made once to ask it.
 
     Raises:
-        ValueError: if there is no such id (near ones are named), if it shows no images, or if
-            its actions are neither a bounded `Box` nor `Discrete`.
-        ModuleNotFoundError: if it needs a package that is not installed.
-        SimulatorError: if its own code raises anything else.
+      ValueError: if there is no such id (near ones are named), if it shows no images, or if
+        its actions are neither a bounded `Box` nor `Discrete`.
+      ModuleNotFoundError: if it needs a package that is not installed.
+      SimulatorError: if its own code raises anything else.
     """
     return _traits(id).task
 
@@ -132,8 +132,8 @@ class GymnasiumSimulator:
     ones the largest entry is the choice. Rewards and ends are the environment's.
 
     Args:
-        title: the id for `gymnasium.make`.
-        image_size: height and width in pixels to which images are resized, whatever their shape.
+      title: the id for `gymnasium.make`.
+      image_size: height and width in pixels to which images are resized, whatever their shape.
     """
 
     def __init__(self, title: str, image_size: int):
@@ -195,8 +195,8 @@ def resize(image: np.ndarray, size: int) -> np.ndarray:
     """An image of any size as uint8 [size, size, 3], each pixel the mean of those it covers.
 
     Args:
-        image: uint8 [height, width], [height, width, 1] or [height, width, 3].
-        size: height and width of the result.
+      image: uint8 [height, width], [height, width, 1] or [height, width, 3].
+      size: height and width of the result.
     """
     image = np.asarray(image, np.uint8)
     image = image.reshape(*image.shape[:2], -1)

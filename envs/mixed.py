@@ -20,8 +20,8 @@ class MixedState(NamedTuple):
     """The state of one slot.
 
     Attributes:
-        slot: int32 [].
-        part: int32 [W], the words of its environment's own state.
+      slot: int32 [].
+      part: int32 [W], the words of its environment's own state.
     """
 
     slot: jax.Array
@@ -32,9 +32,9 @@ class MixedEnv:
     """An `Env` made of others, each with P members and some of the K tasks.
 
     Args:
-        parts: the environments, of images and actions of one size.
-        places: for each of them, which of the K tasks its own tasks are.
-        members: P.
+      parts: the environments, of images and actions of one size.
+      places: for each of them, which of the K tasks its own tasks are.
+      members: P.
     """
 
     discrete = False

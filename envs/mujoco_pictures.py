@@ -58,11 +58,11 @@ class Pictures:
     """Draws one task, for one thread: a renderer and its OpenGL context, kept.
 
     Args:
-        title: one of the six names of the thesis, such as "Walker2D".
-        image_size: height and width of the pictures in pixels.
+      title: one of the six names of the thesis, such as "Walker2D".
+      image_size: height and width of the pictures in pixels.
 
     Raises:
-        SimulatorError: if there is nothing to draw with, and what to install.
+      SimulatorError: if there is nothing to draw with, and what to install.
     """
 
     def __init__(self, title: str, image_size: int):

@@ -20,11 +20,11 @@ class PixelEnv(gymnasium.Env):
     on the seed alone, to the bit; `reset()` starts the next episode in the same one.
 
     Args:
-        task: which task.
-        image_size: height and width of the images in pixels.
-        action_repeat: environment steps for which an action is held, whose rewards are summed;
-            by default the task's.
-        render_mode: "rgb_array" to have `render` return the picture of the present state.
+      task: which task.
+      image_size: height and width of the images in pixels.
+      action_repeat: environment steps for which an action is held, whose rewards are summed;
+        by default the task's.
+      render_mode: "rgb_array" to have `render` return the picture of the present state.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -65,7 +65,7 @@ class PixelEnv(gymnasium.Env):
         """Hold `action` for the action repeat; returns the image after it.
 
         Raises:
-            ValueError: if the action is not finite.
+          ValueError: if the action is not finite.
         """
         if self._simulator is None:
             raise gymnasium.error.ResetNeeded("call reset before step")

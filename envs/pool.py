@@ -90,17 +90,17 @@ class SimulatorPool:
     """One simulator per slot, in worker processes that each host a share of the slots.
 
     Args:
-        tasks: the task of each slot.
-        image_size: height and width of the images in pixels.
-        action_size: A, the length of every action; slots read the first |A| of their task.
-        action_repeat: environment steps for which an action is held.
-        workers: number of processes; by default one for each core, and never more than slots.
-        timeout: seconds after which a simulator that does not answer is taken for stuck, and its
-            process ended.
+      tasks: the task of each slot.
+      image_size: height and width of the images in pixels.
+      action_size: A, the length of every action; slots read the first |A| of their task.
+      action_repeat: environment steps for which an action is held.
+      workers: number of processes; by default one for each core, and never more than slots.
+      timeout: seconds after which a simulator that does not answer is taken for stuck, and its
+        process ended.
 
     Raises:
-        ModuleNotFoundError: if the simulators' package is not installed.
-        SimulatorError: if a process cannot be started, or a simulator fails in its first episode.
+      ModuleNotFoundError: if the simulators' package is not installed.
+      SimulatorError: if a process cannot be started, or a simulator fails in its first episode.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class SimulatorPool:
         """Put new simulators, seeded by `keys` (uint32 [n, words]), into `slots` (int [n]).
 
         Raises:
-            SimulatorError: if a simulator fails or a process dies, with its task and traceback.
+          SimulatorError: if a simulator fails or a process dies, with its task and traceback.
         """
         return self._request("reset", slots, keys.tolist())
 
@@ -158,7 +158,7 @@ class SimulatorPool:
         """One tick of `slots` (int [n], no two alike) with `actions` (float32 [n, A]).
 
         Raises:
-            SimulatorError: if a simulator fails or a process dies, with its task and traceback.
+          SimulatorError: if a simulator fails or a process dies, with its task and traceback.
         """
         self._records["action"][slots] = actions
         return self._request("step", slots, [None] * len(slots))
@@ -209,9 +209,9 @@ class SimulatorPool:
         was interrupted, are passed over.
 
         Args:
-            asked: of each worker asked, the slots, in the order in which it does them.
-            timeout: seconds for which to wait.
-            patience: seconds after which to warn first, by default a few.
+          asked: of each worker asked, the slots, in the order in which it does them.
+          timeout: seconds for which to wait.
+          patience: seconds after which to warn first, by default a few.
         """
         pending = {self._workers[index].connection: index for index in asked}
         failures, error = [], None

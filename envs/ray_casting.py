@@ -49,19 +49,19 @@ def render(
     """The picture of a scene. Jitted; map it with `jax.vmap` for many pictures.
 
     Args:
-        scene: what is seen.
-        positions: of the links in the world, float [L, 3], in metres.
-        rotations: of the links in the world, quaternions (w, x, y, z), float [L, 4]; their
-            length is of no weight.
-        size: height and width in pixels, at least 8.
-        supersample: draw this many times as high and wide, and let each pixel be the mean of
-            those that it covers.
+      scene: what is seen.
+      positions: of the links in the world, float [L, 3], in metres.
+      rotations: of the links in the world, quaternions (w, x, y, z), float [L, 4]; their
+        length is of no weight.
+      size: height and width in pixels, at least 8.
+      supersample: draw this many times as high and wide, and let each pixel be the mean of
+        those that it covers.
 
     Returns:
-        uint8 [size, size, 3].
+      uint8 [size, size, 3].
 
     Raises:
-        ValueError: for a size or shape that does not fit.
+      ValueError: for a size or shape that does not fit.
     """
     check_size(size, supersample)
     positions, rotations = jnp.asarray(positions), jnp.asarray(rotations)
@@ -117,8 +117,8 @@ def _frames(scene: Scene, positions, rotations):
     """How each geometry sees the camera, and where the camera is.
 
     Returns:
-        float32 [G, 3, 4]: the camera's axes right, up and forwards, and its place, as columns in
-        the geometry's frame; and float32 [3].
+      float32 [G, 3, 4]: the camera's axes right, up and forwards, and its place, as columns in
+      the geometry's frame; and float32 [3].
     """
     highest = jax.lax.Precision.HIGHEST
     links = np.array([geometry.link for geometry in scene.geometries])

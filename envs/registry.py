@@ -126,9 +126,9 @@ def spec(name: str) -> TaskSpec:
     """What is known of the task called `name`.
 
     Raises:
-        ValueError: if there is no such task, with those there are; or if a gymnasium environment
-            has no images or no fitting actions.
-        ModuleNotFoundError: if a gymnasium environment needs a package that is not installed.
+      ValueError: if there is no such task, with those there are; or if a gymnasium environment
+        has no images or no fitting actions.
+      ModuleNotFoundError: if a gymnasium environment needs a package that is not installed.
     """
     task = described(name)
     return gymnasium_task(task.title) if is_gymnasium(name) else task
@@ -151,7 +151,7 @@ def described(name: str) -> TaskSpec:
     Of a gymnasium environment that is its title; its other attributes mean nothing.
 
     Raises:
-        ValueError: if there is no such task, with those there are.
+      ValueError: if there is no such task, with those there are.
     """
     if name in _TASKS:
         return _TASKS[name]
@@ -200,8 +200,8 @@ def specs(names: Sequence[str]) -> tuple[TaskSpec, ...]:
     """What is known of the tasks that one agent is to play.
 
     Raises:
-        ValueError: if one is unknown (see `spec`), or some are continuous and others discrete.
-        ModuleNotFoundError: see `spec`.
+      ValueError: if one is unknown (see `spec`), or some are continuous and others discrete.
+      ModuleNotFoundError: see `spec`.
     """
     tasks = tuple(spec(name) for name in names)
     discrete = [task.name for task in tasks if task.discrete]
@@ -227,20 +227,20 @@ def make(
     """The environment of a population: P = `members` simulators of each of K = len(tasks) tasks.
 
     Args:
-        tasks: K names; slot s = member * K + task plays tasks[s % K].
-        members: P, at least 1.
-        image_size: height and width of the images in pixels.
-        action_repeat: environment steps for which an action is held, at least 1.
-        workers: number of simulator processes for each backend, by default min(cores, slots).
-        action_size: A, the length of all actions; by default the largest |A| of the tasks.
-        supersample: pictures are drawn this many times as large and averaged down, which turns
-            the jumps of edges from pixel to pixel into shades; 1 draws them as they are.
-        timeout: seconds after which a simulator process that does not answer is ended, as one that
-            died by itself.
+      tasks: K names; slot s = member * K + task plays tasks[s % K].
+      members: P, at least 1.
+      image_size: height and width of the images in pixels.
+      action_repeat: environment steps for which an action is held, at least 1.
+      workers: number of simulator processes for each backend, by default min(cores, slots).
+      action_size: A, the length of all actions; by default the largest |A| of the tasks.
+      supersample: pictures are drawn this many times as large and averaged down, which turns
+        the jumps of edges from pixel to pixel into shades; 1 draws them as they are.
+      timeout: seconds after which a simulator process that does not answer is ended, as one that
+        died by itself.
 
     Raises:
-        ValueError: for an unknown task or a number that is too small.
-        ModuleNotFoundError: if the tasks' simulator is not installed, with how to install it.
+      ValueError: for an unknown task or a number that is too small.
+      ModuleNotFoundError: if the tasks' simulator is not installed, with how to install it.
     """
     if isinstance(tasks, str):
         raise ValueError(f"got the string {tasks!r}, expected a list of tasks such as [{tasks!r}]")

@@ -28,7 +28,7 @@ def key_words(slot: jax.Array, key: jax.Array) -> jax.Array:
     """A slot and the words of a key (typed or raw) as one row: int32 [W].
 
     Raises:
-        ValueError: if they are several slots or keys.
+      ValueError: if they are several slots or keys.
     """
     if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.key_data(key)
@@ -45,7 +45,7 @@ def action_words(state: Any, action: jax.Array, action_size: int) -> jax.Array:
     """A state's leaves of 32-bit types and an action as one row: int32 [W].
 
     Raises:
-        ValueError: if the action is not of length `action_size`.
+      ValueError: if the action is not of length `action_size`.
     """
     if action.shape != (action_size,):
         raise ValueError(
@@ -74,7 +74,7 @@ class Layout:
     """How a tree of arrays lies in a row of words.
 
     Args:
-        template: the tree, of arrays or `jax.ShapeDtypeStruct`, of 32-bit types and bool.
+      template: the tree, of arrays or `jax.ShapeDtypeStruct`, of 32-bit types and bool.
     """
 
     def __init__(self, template: Any):
@@ -130,14 +130,14 @@ def apply_by_group(
     the rows are done one after another.
 
     Args:
-        functions: one for each group, leaves [m, ...] -> leaves [m, ...], all of the same types.
-        groups: K, the group of each task.
-        members: P.
-        slots: int32 [n], member * K + task.
-        rows: leaves [n, ...].
+      functions: one for each group, leaves [m, ...] -> leaves [m, ...], all of the same types.
+      groups: K, the group of each task.
+      members: P.
+      slots: int32 [n], member * K + task.
+      rows: leaves [n, ...].
 
     Returns:
-        Leaves [n, ...], in the order of the rows.
+      Leaves [n, ...], in the order of the rows.
     """
     tasks = len(groups)
     if len(functions) == 1:

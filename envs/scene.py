@@ -23,9 +23,9 @@ class Checker:
     """A pattern of two colours, by which a plane's own is multiplied.
 
     Attributes:
-        colours: of the fields, the first of that which begins at `corner` towards +x and +y.
-        width: of a field along x and y, in metres.
-        corner: where four fields meet, x and y in the plane's frame, in metres.
+      colours: of the fields, the first of that which begins at `corner` towards +x and +y.
+      width: of a field along x and y, in metres.
+      corner: where four fields meet, x and y in the plane's frame, in metres.
     """
 
     colours: tuple[Vector, Vector]
@@ -38,17 +38,17 @@ class Geometry:
     """One body that rays can hit.
 
     Attributes:
-        kind: "plane", "sphere", "capsule", "ellipsoid", "cylinder" or "box".
-        size: as in MuJoCo, in metres: radius (sphere); radius and half length along z (capsule,
-            whose ends come on top, and cylinder); three radii (ellipsoid); three half lengths
-            (box); half lengths along x and y, or 0 for no end (plane, seen from +z).
-        colour: red, green and blue, each in [0, 1].
-        link: the link it is fixed to; -1 for the world.
-        position: in the link's frame, in metres.
-        rotation: in the link's frame, a quaternion (w, x, y, z).
-        specular: share of a light's specular part that is reflected.
-        shininess: the exponent of highlights.
-        checker: of a plane, its pattern.
+      kind: "plane", "sphere", "capsule", "ellipsoid", "cylinder" or "box".
+      size: as in MuJoCo, in metres: radius (sphere); radius and half length along z (capsule,
+        whose ends come on top, and cylinder); three radii (ellipsoid); three half lengths
+        (box); half lengths along x and y, or 0 for no end (plane, seen from +z).
+      colour: red, green and blue, each in [0, 1].
+      link: the link it is fixed to; -1 for the world.
+      position: in the link's frame, in metres.
+      rotation: in the link's frame, a quaternion (w, x, y, z).
+      specular: share of a light's specular part that is reflected.
+      shininess: the exponent of highlights.
+      checker: of a plane, its pattern.
     """
 
     kind: str
@@ -73,12 +73,12 @@ class Light:
     """A light of one of three kinds.
 
     Attributes:
-        kind: "head" (shines as the camera looks), "directional" or "spot".
-        diffuse, ambient, specular: red, green and blue.
-        direction: in which it shines, in the world; not of a head light.
-        position: of a spot, in the world.
-        cutoff: half the angle of a spot's cone in degrees; 180 for a light to all sides.
-        exponent: how fast a spot fades from its axis.
+      kind: "head" (shines as the camera looks), "directional" or "spot".
+      diffuse, ambient, specular: red, green and blue.
+      direction: in which it shines, in the world; not of a head light.
+      position: of a spot, in the world.
+      cutoff: half the angle of a spot's cone in degrees; 180 for a light to all sides.
+      exponent: how fast a spot fades from its axis.
     """
 
     kind: str
@@ -102,14 +102,14 @@ class Camera:
     """Looks at a point from a distance; by default from -y along +y, z upwards.
 
     Attributes:
-        target: the point that is in the middle of the picture, in metres.
-        link: the link that it follows.
-        follows: along which axes the target is where the link is, instead of as given.
-        distance: from the target in metres.
-        azimuth, elevation: where it looks, in degrees: azimuth 0 along +x, 90 along +y.
-        field_of_view: of the picture's height (and width), in degrees.
-        near: depth before which nothing is seen.
-        far: distance beyond which all is sky.
+      target: the point that is in the middle of the picture, in metres.
+      link: the link that it follows.
+      follows: along which axes the target is where the link is, instead of as given.
+      distance: from the target in metres.
+      azimuth, elevation: where it looks, in degrees: azimuth 0 along +x, 90 along +y.
+      field_of_view: of the picture's height (and width), in degrees.
+      near: depth before which nothing is seen.
+      far: distance beyond which all is sky.
     """
 
     target: Vector = (0.0, 0.0, 0.0)
@@ -136,10 +136,10 @@ class Scene:
     """All that is seen but for where the links are. A constant of a program, and hashable.
 
     Attributes:
-        geometries: G.
-        camera: where it is seen from.
-        lights: whose parts add up.
-        sky: the colour where nothing is.
+      geometries: G.
+      camera: where it is seen from.
+      lights: whose parts add up.
+      sky: the colour where nothing is.
     """
 
     geometries: tuple[Geometry, ...]
@@ -179,12 +179,12 @@ def scene_of(model: Any, camera: Camera | None = None) -> Scene:
     Lights stay where they are in the model's initial state.
 
     Args:
-        model: a `brax.System` or a `mujoco.MjModel`.
-        camera: by default the one with which MuJoCo's viewer begins, which does not move.
+      model: a `brax.System` or a `mujoco.MjModel`.
+      camera: by default the one with which MuJoCo's viewer begins, which does not move.
 
     Raises:
-        ValueError: for a model without anything to draw.
-        NotImplementedError: for a geometry that cannot be drawn, with its name.
+      ValueError: for a model without anything to draw.
+      NotImplementedError: for a geometry that cannot be drawn, with its name.
     """
     if hasattr(model, "mj_model"):
         model = model.mj_model

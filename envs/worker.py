@@ -47,10 +47,10 @@ class StartFailure(NamedTuple):
     """Why a worker cannot serve: text only, as not every exception can be pickled.
 
     Attributes:
-        slot: whose simulator failed.
-        problem: what is wrong with it.
-        trace: the traceback, if there is one.
-        is_missing: whether a package is not installed.
+      slot: whose simulator failed.
+      problem: what is wrong with it.
+      trace: the traceback, if there is one.
+      is_missing: whether a package is not installed.
     """
 
     slot: int
@@ -188,7 +188,7 @@ def _try(task: TaskSpec, settings: WorkerSettings) -> str | None:
     """Starts an episode and looks at it, so that what is not installed is known at once.
 
     Returns:
-        What is wrong with its picture, if anything.
+      What is wrong with its picture, if anything.
     """
     simulator = _make_simulator(task, settings)
     try:
@@ -230,9 +230,9 @@ def main(connection_descriptor: int, memory_descriptor: int, parent: int) -> Non
     """Serve the pool at the other end of the socket; returns when it is gone.
 
     Args:
-        connection_descriptor: of the socket.
-        memory_descriptor: of the shared memory.
-        parent: the process to end with; 0 to end only after the request in work.
+      connection_descriptor: of the socket.
+      memory_descriptor: of the shared memory.
+      parent: the process to end with; 0 to end only after the request in work.
     """
     _die_with(parent)
     # Ctrl-C is for the process that trains, which ends its phase with our help.

@@ -23,7 +23,7 @@ import difflib
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -249,7 +249,7 @@ def _folder(trained: Trained | str | Path) -> str:
     return str(trained.directory if isinstance(trained, Trained) else trained)
 
 
-def _several(values: Any, kind: Callable[[Any], Any]) -> tuple[Any, ...]:
+def _several(values: Any, kind: type) -> tuple[Any, ...]:
     """One value or several, as several."""
     return (values,) if isinstance(values, kind) else tuple(values)
 

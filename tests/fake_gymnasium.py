@@ -15,9 +15,9 @@ class Scripted(gymnasium.Env):
     """Step k is rewarded with the sum of its action; images are full of 10 k.
 
     Args:
-        observations: the space of observations.
-        actions: the space of actions.
-        end: the step that terminates an episode, if any.
+      observations: the space of observations.
+      actions: the space of actions.
+      end: the step that terminates an episode, if any.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}

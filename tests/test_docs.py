@@ -1,5 +1,6 @@
 """The pages of docs/: their Python runs and prints what they show; what they name is there."""
 
+import ast
 import contextlib
 import io
 import re
@@ -76,3 +77,29 @@ def test_links_and_files_that_a_page_names_are_there(page):
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def docstrings(path):
+    """The docstrings of what is public in a file: (name, text)."""
+    nodes = [ast.parse(path.read_text(encoding="utf-8"))]
+    while nodes:
+        node = nodes.pop()
+        name = getattr(node, "name", "__init__")
+        if name.startswith("_") and name != "__init__":
+            continue
+        yield name, ast.get_docstring(node) or ""
+        kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+        nodes += [inner for inner in node.body if isinstance(inner, kinds)]
+
+
+@pytest.mark.parametrize("package", ["transfer", "dreamer_jax", "envs", "experiments"])
+def test_sections_of_docstrings_are_indented_by_two_spaces(package):
+    section = re.compile(r"^(?:Args|Attributes|Raises|Returns):\n( *)", re.MULTILINE)
+    found = [
+        (path.name, name, len(indent))
+        for path in (ROOT / package).rglob("*.py")
+        for name, text in docstrings(path)
+        for indent in section.findall(text)
+    ]
+    assert [place for place in found if place[2] != 2] == []
+    assert len(found) > 20

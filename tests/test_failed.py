@@ -36,7 +36,7 @@ def run(tmp_path_factory):
 
 def test_a_row_that_says_so_or_a_return_that_is_no_number_is_a_failure(tmp_path):
     assert failed_members(tmp_path) == set()
-    evaluation = {"kind": "evaluation", "member": 2, "return": float("nan")}
+    evaluation = {"kind": "evaluation", "member": 2, "env_steps": 80, "return": float("nan")}
     write_rows(tmp_path, row(0), row(1, healthy=False), row(1), evaluation)
     assert failed_members(tmp_path) == {1, 2}
 
@@ -76,4 +76,4 @@ def test_a_plan_names_the_cells_that_failed(tmp_path):
         file.write(json.dumps(row(2, healthy=False)) + "\n")
     (targets,) = plan_runs(cells, CONFIG, tmp_path)
     assert (targets.state, targets.failed) == ("done", (targets.cells[2],))
-    assert "done, 1 failed" in plan_table([targets], None)
+    assert "1 failed" in plan_table([targets], None)

@@ -141,6 +141,7 @@ def test_a_new_method_has_its_options_without_another_file_being_touched(clippin
         lambda spec, out, **_: asked.append(spec) or types.SimpleNamespace(),
     )
     monkeypatch.setattr("experiments.runs.run.carry_out", lambda run: "stopped")
+    monkeypatch.setattr("experiments.runs.trust.check_trust", lambda *_: None)
     monkeypatch.setattr("pathlib.Path.read_text", lambda *_, **__: "")
     words = ["train", "--task", "bullet/hopper", "--preset", "debug", "--out", "nowhere"]
     words += ["--method", "clipping", "--source", "a", "--limit", "0.5", "2", "--baseline"]

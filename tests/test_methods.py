@@ -433,6 +433,8 @@ def test_latent_states_are_samples_along_episodes_or_their_means_or_of_single_im
         ({"method": "uae", "sources": ("x",), "baseline": True},
          "--baseline belongs to --method .*frac"),
         ({"method": "uae", "sources": ("x", "y")}, "add --source DIR, one only"),
+        ({"method": "frozen-source", "sources": ("x",), "baseline": True},
+         "leave out --baseline, and train them in a run of their own"),
         ({"sources": ("x", "x"), "omegas": (0.2,)}, "a source is named twice"),
         ({"sources": ("x",), "omegas": (0.2,), "dynamics": "frozen"},
          "--dynamics belongs to .*uae or"),

@@ -62,7 +62,7 @@ def test_the_command_names_what_to_run_next(tmp_path, capsys):
     assert "InvertedPendulum, 2 tasks, ω = 0.1  0 / 5" in printed
     assert (
         "next: python -m experiments table 7 --preset debug --seeds 0 1 2 3 4 5 6 7 8 9 "
-        f"--omegas 0 0.1 --counts 2 --results {tmp_path}" in printed
+        f"--omegas 0.0 0.1 --counts 2 --results {tmp_path}" in printed
     )
 
 
@@ -72,6 +72,7 @@ def test_the_command_names_what_to_run_next(tmp_path, capsys):
         (["13"], "table-13 compares no returns"),
         (["99"], "unknown table '99'"),
         (["7", "--group", "1"], "a group has at least 2 seeds"),
+        (["7", "--compared", "luck"], "compared ('luck',) must be some of"),
     ],
 )
 def test_what_cannot_be_answered_is_refused(arguments, message, capsys):

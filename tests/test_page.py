@@ -162,6 +162,18 @@ def test_noise_is_told_as_no_difference(tmp_path, drawn):
     assert '<span class="verdict undecided">undecided</span>' in text
 
 
+def test_methods_of_comparison_have_sentences_and_forests_of_their_own(tmp_path, drawn):
+    root = tmp_path / "debug"
+    tuned = [grid.compared("bullet", TARGET, 2, "fine-tuning", seed, 0) for seed in SEEDS]
+    write_folder(root, "scratch", baselines(SEEDS), rising)
+    write_folder(root, "tuned", tuned, rising)
+    text = page.write_page(root, SEEDS, "bullet", tmp_path / "index.html").read_text("utf-8")
+    answer = section(text, "answers")
+    assert "Fine-tuning: of 2 comparisons with agents from scratch" in answer
+    assert "Fractional transfer" not in answer and "Frozen-source" not in answer
+    assert '<th scope="row">2 tasks, fine-tuning</th>' in answer
+
+
 # --- tables and figures ---------------------------------------------------------------------------
 
 

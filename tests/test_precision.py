@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from compilation import QUICK_CODE
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import collect
 from probes import Probe
 
-A, STORED, UPDATES, SEEDS = 2, 10, 300, 4
+A, STORED, UPDATES, SEEDS = 2, 10, 200, 3
 CONFIG = preset("debug")
 B, L = CONFIG.learning.batch_size, CONFIG.learning.sequence_length
 LOSSES = ("image_loss", "reward_loss", "kl", "termination_loss", "actor_loss", "value_loss")
@@ -86,7 +85,7 @@ def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
     )
 
 
-def test_after_300_updates_the_losses_are_those_of_float32_within_the_noise_of_seeds():
+def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_seeds():
     batches = stored_batches(agent_of("float32"))
 
     def losses(precision):
@@ -101,7 +100,7 @@ def test_after_300_updates_the_losses_are_those_of_float32_within_the_noise_of_s
             return jax.lax.scan(update, agent.init(seed), jnp.arange(UPDATES) % STORED)
 
         # One after another: that compiles faster than all at once.
-        every = jax.jit(lambda seeds: jax.lax.map(train, seeds), compiler_options=QUICK_CODE)
+        every = jax.jit(lambda seeds: jax.lax.map(train, seeds))
         states, history = every(jnp.arange(SEEDS))
         assert states.healthy.all()
         return {name: np.asarray(x) for name, x in history.items()}

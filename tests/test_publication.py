@@ -73,9 +73,10 @@ def test_methods_of_comparison_have_rows_beside_the_baseline(root, tmp_path):
     records = list(csv.DictReader((tmp_path / "out" / "table-7.csv").open(encoding="utf-8")))
     (record,) = [one for one in records if one["method"] == "fine-tuning" and one["sources"] == "2"]
     assert (record["omega"], record["difference"]) == ("", "100.0")
-    # What is told of fractional transfer is told of it alone.
+    # Each method is told of alone.
     outcomes = read_outcomes(root, grid.shown(table, SEEDS))
-    (finding,) = findings.findings([table], outcomes, SEEDS)
+    finding, tuned = findings.findings([table], outcomes, SEEDS)
+    assert (finding.method, tuned.method) == ("Fractional transfer", "Fine-tuning")
     compared = [c.entry for group in finding.comparisons["overall"].values() for c in group]
     assert {entry.method for entry in compared} == {None} and compared
 

@@ -50,11 +50,19 @@ def test_keys_of_all_purposes_members_tasks_phases_and_updates_differ():
             for task in range(3)
         ),
     ]
-    # An update and a phase go on with the halves of their keys.
-    halves = jax.vmap(jax.random.split)(jnp.stack(keys[3:])).reshape(-1)
-    keys += [*halves, *(randomness.component_key(keys[0], name) for name in COMPONENTS)]
-    found = [words(key) for key in keys]
-    assert len(set(found)) == len(found)
+    components = [randomness.component_key(keys[0], name) for name in COMPONENTS]
+    assert len(set(map(words, [*keys, *components]))) == len(keys) + len(components)
+    # What is drawn from: the halves of the keys of updates, phases and comparisons.
+    drawn = [
+        *jax.vmap(jax.random.split)(jnp.stack(keys[3:])).reshape(-1),
+        *(
+            randomness.latent_key(seed, phase, task)
+            for seed in range(3)
+            for phase in range(4)
+            for task in range(3)
+        ),
+    ]
+    assert len(set(map(words, drawn))) == len(drawn)
 
 
 def test_what_is_drawn_beside_a_key_is_not_what_is_drawn_from_it():

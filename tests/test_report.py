@@ -157,7 +157,12 @@ def test_all_evaluations_are_a_table_that_pandas_reads(folder, tmp_path):
     }
     transfers = frame[frame["method"] == "fractional"]
     assert sorted(transfers["omega"].unique()) == [0.0, 0.2]
-    assert set(transfers["from"]) == {"source"} and set(frame["state"]) == {"cut"}
+    assert set(transfers["from"]) == {"source"}
+    # Two evaluations are all of a run of two tasks, and half of those of a run of one.
+    assert frame.groupby("folder")["state"].unique().map(list).to_dict() == {
+        "targets": ["cut"],
+        "both": ["done"],
+    }
     assert frame[frame["method"] == "scratch"]["omega"].isna().all()
 
 

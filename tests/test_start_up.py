@@ -43,6 +43,7 @@ def cpu_seconds(*arguments, folder=ROOT, code=0):
         (["train", "--help"], 0, "config.network options"),
         (["train", "--omeega", "1"], 2, "--omeega"),
         (["train", "--preset", "cpuu", "--help"], 2, "did you mean 'cpu'"),
+        (["train", "--task", "bullet/hoper", "--out", "x"], 2, "Did you mean bullet/hopper"),
         (["table", "99"], 2, "unknown table '99': choose from 1 to 17"),
     ],
 )
@@ -91,6 +92,7 @@ def asked(monkeypatch):
     specs = []
     monkeypatch.setattr("experiments.runs.run.make_run", lambda spec, out, **_: specs.append(spec))
     monkeypatch.setattr("experiments.runs.run.carry_out", lambda run: "stopped")
+    monkeypatch.setattr("experiments.runs.trust.check_trust", lambda *_: None)
     monkeypatch.setattr("pathlib.Path.read_text", read_text)
     return specs
 

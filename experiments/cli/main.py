@@ -161,6 +161,6 @@ def _overview(program: str) -> str:
     """What commands there are."""
     lines = [f"usage: {program} COMMAND [OPTIONS]", ""]
     for name, command in COMMANDS.items():
-        first, *_ = inspect.getdoc(command.options()).splitlines()
+        first, *_ = (inspect.getdoc(command.options()) or "").splitlines()
         lines.append(f"  {name:<10}{first}")
     return "\n".join([*lines, "", f"more of one: {program} COMMAND --help"])

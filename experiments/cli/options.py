@@ -40,7 +40,7 @@ class Base:
       values: what else the file says, by name.
     """
 
-    preset: str
+    preset: Preset
     config: Config
     file: Path | None
     values: Mapping[str, Any]
@@ -62,7 +62,7 @@ def read_base(arguments: Sequence[str]) -> Base:
     values = {} if found.config is None else read_settings(found.config)
     preset = found.preset or values.get("preset") or DEFAULT_PRESET
     config = _over(configs.preset(preset), values.get("config") or {}, found.config)
-    return Base(preset, config, found.config, values)
+    return Base(typing.cast(Preset, preset), config, found.config, values)
 
 
 def read_settings(path: Path) -> dict[str, Any]:

@@ -58,6 +58,8 @@ class Seeds:
     """The fractions that are to be compared; the fewer, the fewer seeds they need."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """The numbers of source tasks that are to be compared."""
+    compared: tuple[str, ...] = ()
+    """Further methods that are to be compared, see `table`."""
     backend: Backend = "bullet"
     """The simulators."""
     results: Path = Path("results")
@@ -173,6 +175,8 @@ def seeds(command: Seeds) -> int:
         for table in tables:
             if table.kind == "ltc":
                 raise ValueError(f"{table.name} compares no returns: choose of 1 to 12, 16 and 17")
+        if not set(command.compared) <= set(grid.COMPARED):
+            raise ValueError(f"compared {command.compared} must be some of {grid.COMPARED}")
     root = command.results / command.preset
     on_disk = seeds_on_disk(root, _on_backend(command.backend), command.backend)
     open_seeds: set[int] = set()
@@ -181,6 +185,7 @@ def seeds(command: Seeds) -> int:
             table,
             omegas=tuple(omega for omega in table.omegas if omega in command.omegas),
             counts=tuple(count for count in table.counts if count in command.counts),
+            compared=command.compared if table.kind == "ftl" else (),
         )
         asked = on_disk or (0,)
         outcomes = read_outcomes(root, grid.shown(table, asked))
@@ -208,9 +213,9 @@ def seeds(command: Seeds) -> int:
 def _other_options(command: Seeds) -> str:
     """The options of a table that are not its defaults, as they are typed."""
     words = ""
-    for name in ("omegas", "counts"):
+    for name in ("omegas", "counts", "compared"):
         values = getattr(command, name)
         if values != getattr(Seeds, name):
-            words += f" --{name} {' '.join(f'{value:g}' for value in values)}"
+            words += f" --{name} {' '.join(map(str, values))}"
     words += f" --backend {command.backend}" if command.backend != "bullet" else ""
     return words + (f" --results {command.results}" if command.results != Path("results") else "")

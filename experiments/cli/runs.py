@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-import envs
 from dreamer_jax.config import Config
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.ranges import setting
@@ -83,14 +82,15 @@ class Train:
 def train_options() -> type:
     """The options of `train`: a group for the run, one for the method, those of the settings of
     methods, and those of the agent's settings."""
-    choices = Literal[tuple(methods.known())]  # type: ignore[valid-type]
+    choices: Any = Literal[tuple(methods.known())]
     named = Annotated[choices | None, tyro.conf.arg(help=method_summary())]
     chooses = dataclasses.make_dataclass(
         "transfer", [("method", named, dataclasses.field(default=None))], frozen=True
     )
     chooses.__doc__ = "How knowledge is transferred from a trained agent, if at all."
-    groups = {"run": Run, "transfer": chooses, **method_groups(), "config": Config}
-    fields = [(name, tyro.conf.OmitArgPrefixes[kind]) for name, kind in groups.items()]
+    groups: dict[str, Any] = {"run": Run, "transfer": chooses, **method_groups(), "config": Config}
+    without_prefix: Any = tyro.conf.OmitArgPrefixes
+    fields = [(name, without_prefix[kind]) for name, kind in groups.items()]
     found = dataclasses.make_dataclass("TrainOptions", fields, frozen=True)
     found.__doc__ = inspect.getdoc(Train)
     return found
@@ -194,9 +194,9 @@ class Verify:
 
 def train(command: Train) -> int:
     """Trains a population."""
+    import envs
     from experiments.cli.reports import Report, report
     from experiments.runs.spec import RunSpec
-    from experiments.runs.trust import check_trust, is_of_another
 
     run = command.run
     if run.from_checkpoint == "list":
@@ -209,6 +209,9 @@ def train(command: Train) -> int:
         method = make_method(command.method, command.transfer)
         spec = RunSpec(run.task, run.seeds, command.config, method)
         envs.specs(spec.tasks)
+    from experiments.runs.trust import check_trust, is_of_another
+
+    with usage_errors():
         check_trust([*method.sources, *method.stored], run.trust)
         if is_of_another(run.out):
             check_trust([run.out], run.trust)
@@ -307,7 +310,7 @@ def classify(command: Classify) -> int:
     from experiments.runs.agents import load_source
     from experiments.runs.trust import check_trust
 
-    request = {
+    request: dict[str, Any] = {
         "samples": command.samples,
         "neighbours": command.neighbours,
         "quantile": command.quantile,

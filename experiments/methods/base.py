@@ -114,13 +114,22 @@ class Knowledge(NamedTuple):
 class Cell(Protocol):
     """An agent of a grid, as methods see it: see `experiments.thesis.grid.Cell`."""
 
-    backend: str
-    tasks: tuple[str, ...]
-    method: str
-    seed: int
-    source: Any
-    omega: float | None
-    reward_sources: tuple[Any, ...]
+    @property
+    def name(self) -> str: ...
+    @property
+    def backend(self) -> str: ...
+    @property
+    def tasks(self) -> tuple[str, ...]: ...
+    @property
+    def method(self) -> str: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def source(self) -> Any: ...
+    @property
+    def omega(self) -> float | None: ...
+    @property
+    def reward_sources(self) -> tuple[Any, ...]: ...
 
 
 Held = Mapping[str, tuple[str, int]]

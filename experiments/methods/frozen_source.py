@@ -4,6 +4,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar
 
+from experiments.methods.base import require
 from experiments.methods.targets import Targets
 
 _FROZEN = ("encoder/**", "decoder/**", "dynamics/**", "!dynamics/action_in/*")
@@ -20,6 +21,19 @@ class FrozenSource(Targets):
 
     NAME: ClassVar[str] = "frozen-source"
     SUMMARY: ClassVar[str] = "everything copied where shapes fit, all but the heads frozen"
+
+    def check_settings(self) -> None:
+        """Checks the sources; what is frozen is frozen in all agents of a run.
+
+        Raises:
+          ValueError: with the way out.
+        """
+        super().check_settings()
+        require(
+            not self.baseline,
+            f"--method {self.NAME} freezes parts of all agents of its run, those from scratch too: "
+            "leave out --baseline, and train them in a run of their own",
+        )
 
     def plan(self, unfit: Collection[str] = ("dynamics/action_in/*", "actor/out/*")):
         """Copies all but what does not fit, and freezes what is no head.

@@ -132,7 +132,7 @@ class MetaModel(UniversalAutoencoder):
         """The components that are meta-models."""
         from experiments.methods.modules.meta import meta_dynamics, meta_head
 
-        found = []
+        found: list[tuple[str, Any]] = []
         for name in self.meta:
             if name == "dynamics":
                 found.append((name, meta_dynamics(agent.dynamics, places=self.places)))
@@ -236,7 +236,9 @@ class MetaModel(UniversalAutoencoder):
 
         from transfer import ltc
 
-        latents, labels, episodes = [], [], []
+        latents: list[Any] = []
+        labels: list[int] = []
+        episodes: list[Any] = []
         for place, source in enumerate(sources):
             parts = sample(source, KNOWN_SAMPLES)
             shares = np.array_split(np.arange(KNOWN_SAMPLES), len(parts))
@@ -247,7 +249,7 @@ class MetaModel(UniversalAutoencoder):
                 # Distinct numbers for the episodes of all tasks of all sources.
                 episodes.append(drawn.episodes + (max(map(np.max, episodes)) if episodes else 0))
         model = ltc.fit(np.concatenate(latents), np.array(labels))
-        threshold = self.threshold
+        threshold: Any = self.threshold
         if threshold is None:
             threshold = ltc.suggest_threshold(model, groups=np.concatenate(episodes))
         return {

@@ -12,7 +12,7 @@ from experiments.reports.sheet import interval, verdict_word
 from experiments.thesis.grid import Cell, Metric, Table
 
 METHODS = {"ftl": "Fractional transfer", "meta": "Reward meta-models"}
-"""What the methods of tables are called, by their kinds."""
+"""What the own methods of tables are called, by their kinds."""
 COLOURS = {"positive": "#1a7f37", "negative": "#c62828"}
 """Of differences that are decided; others are grey."""
 UNDECIDED = "#6b7280"
@@ -49,7 +49,7 @@ class Finding:
     """What there is on one method.
 
     Attributes:
-      kind: of its tables.
+      kind: of its tables, or the name of a method that is compared with theirs.
       method: what it is called.
       sentence: what its comparisons say.
       comparisons: all of them, by metric and then by target, as the tables have them.
@@ -71,31 +71,34 @@ def findings(
       outcomes: of all cells that they show.
       seeds: of targets and baselines; the first one is the sources'.
     """
-    found = []
-    tables = list(tables)
-    for kind, method in METHODS.items():
-        begun, by_metric = False, {}
-        for table in tables:
-            if table.kind != kind:
+    begun: set[tuple[str, str]] = set()
+    found: dict[tuple[str, str], dict[Metric, dict[str, list[Comparison]]]] = {}
+    for table in tables:
+        if table.kind not in METHODS:
+            continue
+        entries = comparison.compare(table, outcomes, seeds)
+        for entry in entries.values():
+            if entry.sources is None:
                 continue
-            entries = comparison.compare(table, outcomes, seeds)
-            begun |= any(
-                e.begun for e in entries.values() if e.sources is not None and e.method is None
-            )
-            for entry in entries.values():
-                if entry.transfer is None or entry.method is not None:
-                    continue
-                base = entries[entry.target, None, None]
-                by_target = by_metric.setdefault(table.metric, {})
-                by_target.setdefault(entry.target, []).append(Comparison(table.metric, entry, base))
-        if begun:
-            for by_target in by_metric.values():
-                for group in by_target.values():
-                    group.sort(key=lambda one: (one.entry.sources, one.entry.omega or 0.0))
-            groups = [group for targets in by_metric.values() for group in targets.values()]
-            told = sentence(method, [one for group in groups for one in group])
-            found.append(Finding(kind, method, told, by_metric))
-    return found
+            # Methods that are compared with a table's own have sentences of their own.
+            own = (table.kind, METHODS[table.kind])
+            key = own if entry.method is None else (entry.method, entry.method.capitalize())
+            by_metric = found.setdefault(key, {})
+            if entry.begun:
+                begun.add(key)
+            if entry.transfer is not None:
+                group = by_metric.setdefault(table.metric, {}).setdefault(entry.target, [])
+                group.append(Comparison(table.metric, entry, entries[entry.target, None, None]))
+    told = []
+    for (kind, method), by_metric in found.items():
+        if (kind, method) not in begun:
+            continue
+        groups = [group for targets in by_metric.values() for group in targets.values()]
+        for group in groups:
+            group.sort(key=lambda one: (one.entry.sources, one.entry.omega or 0.0))
+        words = sentence(method, [one for group in groups for one in group])
+        told.append(Finding(kind, method, words, by_metric))
+    return told
 
 
 def sentence(method: str, comparisons: Sequence[Comparison]) -> str:

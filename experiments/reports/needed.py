@@ -112,4 +112,4 @@ def as_text(needs: Sequence[Need]) -> str:
         counts = f"{len(need.entry.scores)} / {len(need.baseline.scores)}"
         difference = "-" if transfer is None else f"{transfer.difference.value:+z.0f}"
         rows.append([need.entry.full_name, counts, difference, in_words(need)])
-    return aligned(["", "seeds", "difference", ""], rows)
+    return aligned(["", "seeds", "difference", "state"], rows)

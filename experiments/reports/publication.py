@@ -10,6 +10,7 @@ from experiments.reports import figures
 from experiments.reports.findings import draw_forest, findings
 from experiments.reports.outcomes import read_outcomes
 from experiments.reports.sheet import STATISTICS_CAPTION, Sheet, read_sheet, size_note
+from experiments.runs.folder import folders
 from experiments.runs.text import aligned
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, Table
@@ -72,14 +73,17 @@ def write_forests(
       root: the folder of results folders.
       seeds: of targets and baselines; the first one is the sources'.
       backend: the simulator.
-      folder: where to; pictures are named forest-ftl and forest-meta.
+      folder: where to; pictures are named forest-ftl, forest-meta, and after the methods that
+        tables compare beside their own.
 
     Returns:
       The files written.
     """
-    root, seeds = Path(root), tuple(seeds)
+    root, seeds, held = Path(root), tuple(seeds), folders(root)
     tables = [
-        grid.on_backend(table, backend) for table in grid.TABLES.values() if table.kind != "ltc"
+        grid.with_compared(grid.on_backend(table, backend), held, seeds)
+        for table in grid.TABLES.values()
+        if table.kind != "ltc"
     ]
     outcomes = read_outcomes(root, [cell for table in tables for cell in grid.shown(table, seeds)])
     size, written = size_note(root), []

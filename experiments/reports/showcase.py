@@ -13,11 +13,12 @@ import numpy as np
 
 import envs
 from dreamer_jax.video import captioned, write_video
+from experiments.methods import BASELINE
 from experiments.reports import verdicts
 from experiments.reports.outcomes import Run
 from experiments.runs.agents import Source
 from experiments.runs.evaluate import Agents, play
-from experiments.runs.spec import BASELINE, RunSpec
+from experiments.runs.spec import RunSpec
 
 FRAMES_A_SECOND = 30
 

@@ -15,10 +15,10 @@ import numpy as np
 
 import envs
 from dreamer_jax.training import Member
+from experiments.methods import BASELINE
 from experiments.reports.curves import Curve, Panel, draw_panels
 from experiments.reports.outcomes import Outcome, Run
 from experiments.reports.statistics import mean_and_deviation
-from experiments.runs.spec import BASELINE
 from experiments.runs.text import aligned, titles
 
 

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.methods import BASELINE
 from experiments.methods.scratch import Scratch
 from experiments.reports.outcomes import Run
 from experiments.runs.folder import CELLS, read_cells
-from experiments.runs.spec import BASELINE
 
 FIRST = (
     "folder",

@@ -67,7 +67,7 @@ def read_cells(folder: Path) -> tuple[str, ...]:
 
 def folders(root: str | Path) -> dict[str, tuple[Path, int]]:
     """Where each cell is: its name -> (results folder, member)."""
-    found = {}
+    found: dict[str, tuple[Path, int]] = {}
     for folder in run_folders(root):
         try:
             names = read_cells(folder)

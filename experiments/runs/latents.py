@@ -19,7 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.progress import Report, unreported
-from dreamer_jax.randomness import LATENT_PHASES
+from dreamer_jax.randomness import LATENT_PHASES, latent_key
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
 from dreamer_jax.waiting import to_host
@@ -120,7 +120,6 @@ def gather(
         action_size=acting.action_size,
         supersample=source.spec.config.schedule.supersample,
     )
-    key = jax.random.key(seed)
     found: list[list[Latents]] = [[] for _ in tasks]
     try:
         for phase in range(phases):
@@ -142,7 +141,7 @@ def gather(
             records = records._replace(action=action)
             for k in range(len(tasks)):
                 one = records.at(k)
-                sampling_key = jax.random.fold_in(jax.random.fold_in(key, phase), k)
+                sampling_key = latent_key(seed, phase, k)
                 inferred = infer(agent, source.params, one, sampling_key, features=features)
                 # Numbers of episodes go on from phase to phase.
                 before = found[k][-1].episodes[-1] if found[k] else 0

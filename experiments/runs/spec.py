@@ -13,7 +13,6 @@ from dreamer_jax.integrity import read_sealed_json
 from dreamer_jax.ranges import check_ranges
 from dreamer_jax.schema import RUN, check_shape
 from experiments import methods
-from experiments.methods.base import BASELINE as BASELINE
 from experiments.methods.base import Method, require
 from experiments.methods.scratch import Scratch
 

@@ -20,7 +20,6 @@ from experiments.thesis.populations import (
     new_populations,
     of_length,
 )
-from experiments.thesis.populations import task_name as task_name
 
 # How members are mapped depends on the machine and changes no result but by rounding.
 _OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
@@ -57,7 +56,8 @@ def changed_settings(root: str | Path) -> tuple[Difference, ...]:
     The length of agents for several tasks is told as that of agents for one. Each value is told
     once; `one` is the runs', `other` the preset's.
     """
-    root, found = Path(root), {}
+    root = Path(root)
+    found: dict[Difference, None] = {}
     if root.name not in configs.PRESETS:
         return ()
     for folder in run_folders(root):
@@ -156,7 +156,8 @@ def _taken_names(root: Path) -> set[str]:
 
 def _places(root: Path) -> tuple[dict[str, tuple[str, int]], dict[str, PlannedRun]]:
     """Where each cell is, name -> (run, member), and the runs that do not say what they hold."""
-    held, damaged = {}, {}
+    held: dict[str, tuple[str, int]] = {}
+    damaged: dict[str, PlannedRun] = {}
     for folder in run_folders(root):
         try:
             names = read_cells(folder)

@@ -167,11 +167,11 @@ def _products(
         products = list(merged.values())
     found = []
     for product in products:
-        values = {
+        along = {
             axis: tuple(dict.fromkeys(places[cell][axis] for cell in product))
             for axis in axes[::-1]
         }
         of = {tuple(places[cell].values()): cell for cell in product}
-        ordered = [of[tuple(chosen.values())] for chosen in methods.combinations(values)]
-        found.append((tuple(ordered), values))
+        ordered = [of[tuple(chosen.values())] for chosen in methods.combinations(along)]
+        found.append((tuple(ordered), along))
     return found
