@@ -29,6 +29,7 @@ class Probe:
     """
 
     discrete = False
+    has_host = True
 
     def __init__(self, action_size=2, image_size=32, falls=True):
         self.action_size, self.image_size, self.falls = action_size, image_size, falls

@@ -165,7 +165,7 @@ def test_samples_of_trained_agents_are_classified(runs, tmp_path):
          "2 agents for 1 tasks"),
         (["--known", "bullet/hopper", "--neighbours", "300"], r"must lie in [1, 100]"),
         (["--known", "bullet/hoper"], "Did you mean bullet/hopper"),
-        (["--known", "bullet/hopper", "--quantile", "2"], "must lie between 0 and 1"),
+        (["--known", "bullet/hopper", "--quantile", "2"], "expected a number in [0 to 1]"),
         (["--known", "bullet/hopper"], "takes actions of size 3"),
     ],
 )  # fmt: skip

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 
-from dreamer_jax.files import read_json
+from dreamer_jax.integrity import read_sealed_json
 from dreamer_jax.schema import RUN, check_shape
 from envs import SimulatorError
 from experiments.reports import comparison, figures
@@ -398,7 +398,7 @@ def _provenance(
         if folder not in runs:
             rows.append((folder.name, "-", "-", "cannot be read", "-"))
             continue
-        header = check_shape(read_json(folder / "run.json"), RUN, folder / "run.json")
+        header = check_shape(read_sealed_json(folder / "run.json"), RUN, folder / "run.json")
         described = ", ".join(f"{k} {v}" for k, v in header.get("versions", {}).items())
         number = versions.setdefault(described or "unknown", len(versions) + 1)
         rows.append(

@@ -7,7 +7,8 @@ import numpy as np
 
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
-from dreamer_jax.files import read_json, write_json_atomically
+from dreamer_jax.files import write_json_atomically
+from dreamer_jax.integrity import read_sealed_json
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.progress import Report, unreported
 from dreamer_jax.schedule import Schedule
@@ -66,7 +67,7 @@ def export(
     counters = Checkpointer(directory / "checkpoints").metadata()["counters"]
     schedule = Schedule(spec.config.schedule, len(spec.tasks))
     steps = schedule.environment_steps(counters["rounds"])
-    header = read_json(directory / "run.json")
+    header = read_sealed_json(directory / "run.json")
     path.parent.mkdir(parents=True, exist_ok=True)
     transfer.save(path, params)
     card = Card(
