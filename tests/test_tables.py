@@ -47,7 +47,7 @@ def root(made):
 def written(monkeypatch):
     """The tables and figures that were to be written, which here is only noted."""
     entries = []
-    monkeypatch.setattr(reports, "write_reports", lambda some, *_: entries.extend(some))
+    monkeypatch.setattr(reports, "_write", lambda some, *_: entries.extend(some))
     return entries
 
 
@@ -119,11 +119,9 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(made, written, 
 def test_a_report_of_all_results_is_of_what_there_is_something_of(root, written):
     before = metrics(root)
     assert main(["report", str(root), "--seeds", "0", "1"]) == 0
-    # Baselines of InvertedPendulum are beside its targets, meta-models and source agents.
-    assert [entry.name for entry in written] == [
-        *(f"table-{number}" for number in (7, 8, 16, 17)),
-        *(f"figure-{number}" for number in (21, 22, 23, 33, 36, 37, 38, 39)),
-    ]
+    # Tables of which a transfer was run, and the figures that have a curve of it, or of baselines.
+    names = [entry.name for entry in written]
+    assert names == ["table-7", "table-8", "figure-21", "figure-36"]
     assert metrics(root) == before
 
 
@@ -186,7 +184,9 @@ def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, capsys):
     words = ["plan", "--table", "7", "--preset", "debug", "--seeds", "0", "1"]
     assert main([*words, "--results", str(made)]) == 0
     output = capsys.readouterr().out
-    assert f"{TARGETS} " in output and f"{TARGETS}-2" in output
+    # Long names are broken after a hyphen.
+    lines = [line.strip() for line in output.splitlines()]
+    assert "fractional" in lines and "fractional-2" in lines
     assert "cut" not in output and "missing" in output and "done" in output
     assert "An estimate" in output
     assert set(folders(made / "debug")) == set(
