@@ -43,7 +43,7 @@ STOPPABLE = trap : INT; run() { echo "$$*"; "$$@" || { code=$$?; test $$code = 1
 
 setup: $(STAMP)bullet+brax+gymnasium+dev  ## Set up .venv with everything
 
-demo: $(STAMP)bullet+brax  ## From a trained agent to fifteen that begin: what a transfer does (10 minutes)
+demo: $(STAMP)bullet+brax  ## From a trained agent to fifteen that begin: what a transfer does (15 minutes)
 	@$(STOPPABLE) $(RUN) -m experiments demo --results $(RESULTS) $(ARGS)
 
 table-%: $(STAMP)$(BACKEND)  ## Make Table N of the thesis from our runs: train what is missing, resume, show
