@@ -77,3 +77,11 @@ def write_folder(root, name, cells, returns, config=None, done=None, failed=()):
                 )
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder
+
+
+def write_done_and_cut(root, seeds):
+    """Four evaluations a run: a baseline and ω = 0 done, ω = 0.1 with two evaluations each."""
+    write_folder(root, "scratch", baselines(seeds), rising)
+    write_folder(root, "targets", targets([0.0], seeds), rising)
+    write_folder(root, "more", targets([0.1], seeds), rising, done=2)
+    return root

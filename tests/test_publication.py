@@ -13,7 +13,7 @@ from experiments.reports.outcomes import read_outcomes
 from experiments.runs.folder import folders
 from experiments.thesis import grid
 from experiments.thesis.grid import FIGURES, TABLES
-from made_up_results import baselines, rising, targets, write_folder
+from made_up_results import baselines, rising, targets, write_done_and_cut, write_folder
 
 SEEDS = (0, 1)
 TARGET = "InvertedPendulum"
@@ -21,12 +21,7 @@ TARGET = "InvertedPendulum"
 
 @pytest.fixture
 def root(tmp_path):
-    """Four evaluations a run: a baseline, ω = 0 complete, ω = 0.1 with two evaluations each."""
-    root = tmp_path / "debug"
-    write_folder(root, "scratch", baselines(SEEDS), rising)
-    write_folder(root, "targets", targets([0.0], SEEDS), rising)
-    write_folder(root, "more", targets([0.1], SEEDS), rising, done=2)
-    return root
+    return write_done_and_cut(tmp_path / "debug", SEEDS)
 
 
 @pytest.fixture(autouse=True)

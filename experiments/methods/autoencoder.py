@@ -4,46 +4,29 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from dreamer_jax.ranges import Range
 from experiments.methods.base import (
-    SOURCE_HELP,
     Cell,
+    FromSources,
     Held,
     Knowledge,
-    Method,
     require,
     setting,
 )
 
 
 @dataclass(frozen=True)
-class UniversalAutoencoder(Method):
+class UniversalAutoencoder(FromSources):
     """Targets with a source's frozen encoder, one per seed."""
 
     NAME: ClassVar[str] = "uae"
     SUMMARY: ClassVar[str] = "on a source's frozen encoder, and its decoder"
 
-    sources: tuple[str, ...] = setting(
-        (),
-        "source",
-        SOURCE_HELP,
-        folder=True,
-    )
-    source_member: int = setting(
-        0,
-        "source-member",
-        "Which member of each source's population.",
-        allowed=Range(0, 10**6),
-    )
     dynamics: Literal["fresh", "copied", "frozen"] = setting(
         "fresh",
         "dynamics",
         "The latent dynamics, drawn anew, or copied from the source to train on, or copied and "
         "frozen but for the kernel of the action.",
     )
-
-    def __post_init__(self):
-        self.check_settings()
 
     def check_settings(self) -> None:
         """Checks the source.

@@ -269,3 +269,27 @@ class Method:
           held: where their sources are.
         """
         return cls()
+
+
+@dataclass(frozen=True)
+class FromSources(Method):
+    """A method that begins from trained agents; `check_settings` checks its settings."""
+
+    sources: tuple[str, ...] = setting((), "source", SOURCE_HELP, folder=True)
+    source_member: int = setting(
+        0,
+        "source-member",
+        "Which member of each source's population.",
+        allowed=Range(0, 10**6),
+    )
+
+    def __post_init__(self):
+        self.check_settings()
+
+    def check_settings(self) -> None:
+        """Checks the method's settings.
+
+        Raises:
+          ValueError: with the way out.
+        """
+        raise NotImplementedError

@@ -4,20 +4,17 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar
 
-from experiments.methods.targets import Targets
-
-# What is of the actions' size, in every agent.
-_OF_ACTIONS = ("dynamics/action_in/*", "actor/out/*")
+from experiments.methods.targets import OF_ACTIONS, CopiedTargets
 
 
 @dataclass(frozen=True)
-class FineTuning(Targets):
+class FineTuning(CopiedTargets):
     """One target per source and seed, which begins as its source."""
 
     NAME: ClassVar[str] = "fine-tuning"
     SUMMARY: ClassVar[str] = "everything copied where shapes fit, and trained on"
 
-    def plan(self, unfit: Collection[str] = _OF_ACTIONS):
+    def plan(self, unfit: Collection[str] = OF_ACTIONS):
         """Copies all but what does not fit.
 
         Args:
@@ -30,14 +27,6 @@ class FineTuning(Targets):
         if unfit:
             rules.append(Rule(tuple(unfit), "keep", note="random: another shape in the source"))
         return Plan(name=self.NAME, rules=tuple(rules))
-
-    def knowledge(self, agent, seeds, sources, sample):
-        """Each target's source, as far as it fits."""
-        import jax
-
-        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
-        plan = self.plan(self.unfit(fresh, sources))
-        return self.from_sources(plan, seeds, sources, fresh)
 
 
 METHOD = FineTuning

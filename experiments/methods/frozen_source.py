@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from experiments.methods.base import require
-from experiments.methods.targets import Targets
+from experiments.methods.targets import OF_ACTIONS, CopiedTargets
 
 _FROZEN = ("encoder/**", "decoder/**", "dynamics/**", "!dynamics/action_in/*")
 _TRAINED = ("dynamics/action_in/*", "reward/**", "value/**", "actor/**")
@@ -13,7 +13,7 @@ _OPTIONAL = ("termination/**",)
 
 
 @dataclass(frozen=True)
-class FrozenSource(Targets):
+class FrozenSource(CopiedTargets):
     """One target per source and seed, of whose world model only the heads are trained.
 
     The kernel of the action trains, too: its size and meaning change with the task.
@@ -35,7 +35,7 @@ class FrozenSource(Targets):
             "leave out --baseline, and train them in a run of their own",
         )
 
-    def plan(self, unfit: Collection[str] = ("dynamics/action_in/*", "actor/out/*")):
+    def plan(self, unfit: Collection[str] = OF_ACTIONS):
         """Copies all but what does not fit, and freezes what is no head.
 
         Args:
@@ -55,14 +55,6 @@ class FrozenSource(Targets):
         if unfit:
             rules.append(Rule(tuple(unfit), "keep", note="random: another shape in the source"))
         return Plan(name=self.NAME, rules=tuple(rules))
-
-    def knowledge(self, agent, seeds, sources, sample):
-        """Each target's source, as far as it fits."""
-        import jax
-
-        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
-        plan = self.plan(self.unfit(fresh, sources))
-        return self.from_sources(plan, seeds, sources, fresh)
 
 
 METHOD = FrozenSource

@@ -1,17 +1,15 @@
 """What methods share that make targets of their own for each of several sources."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dreamer_jax.ranges import Range
 from experiments.methods.base import (
-    SOURCE_HELP,
     Cell,
+    FromSources,
     Held,
     Knowledge,
-    Method,
     Sources,
     require,
     setting,
@@ -19,27 +17,12 @@ from experiments.methods.base import (
 
 
 @dataclass(frozen=True)
-class Targets(Method):
+class Targets(FromSources):
     """Targets of one or several sources: all combinations of sources, variants and seeds."""
 
-    sources: tuple[str, ...] = setting(
-        (),
-        "source",
-        SOURCE_HELP,
-        folder=True,
-    )
-    source_member: int = setting(
-        0,
-        "source-member",
-        "Which member of each source's population.",
-        allowed=Range(0, 10**6),
-    )
     baseline: bool = setting(
         False, "baseline", "Add agents from scratch, one per seed, to the transfer targets."
     )
-
-    def __post_init__(self):
-        self.check_settings()
 
     def check_settings(self) -> None:
         """Checks the settings that all such methods have.
@@ -147,3 +130,28 @@ class Targets(Method):
         """The settings that name the sources of cells."""
         places = [held[source.name] for source in axes["source"]]
         return {"sources": tuple(name for name, _ in places), "source_member": places[0][1]}
+
+
+OF_ACTIONS = ("dynamics/action_in/*", "actor/out/*")
+"""What is of the actions' size, in every agent."""
+
+
+@dataclass(frozen=True)
+class CopiedTargets(Targets):
+    """Targets that begin as their sources, as far as shapes fit."""
+
+    def plan(self, unfit: Collection[str] = OF_ACTIONS):
+        """What is copied and what is drawn anew.
+
+        Args:
+          unfit: patterns of the leaves that the sources have in another shape, or not at all.
+        """
+        raise NotImplementedError
+
+    def knowledge(self, agent, seeds, sources, sample):
+        """Each target's source, as far as it fits."""
+        import jax
+
+        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
+        plan = self.plan(self.unfit(fresh, sources))
+        return self.from_sources(plan, seeds, sources, fresh)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import jax
 import numpy as np
 
 import transfer
@@ -12,10 +11,9 @@ from dreamer_jax.integrity import read_sealed_json
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.progress import Report, unreported
 from dreamer_jax.schedule import Schedule
-from experiments.runs.agents import check_sound, load_params
+from experiments.runs.agents import load_source
 from experiments.runs.evaluate import evaluate, load_agents
 from experiments.runs.exported import FORMAT, SUFFIX, Card, file_sha256
-from experiments.runs.spec import read_spec
 
 
 def export(
@@ -52,14 +50,8 @@ def export(
             raise FileExistsError(f"{there} is there already: choose another name, or remove it")
     if episodes < 1:
         raise ValueError(f"a card needs episodes: {episodes} were asked for, must be at least 1")
-    spec = read_spec(directory)
-    members = spec.members
-    if not 0 <= member < len(members):
-        raise ValueError(
-            f"{directory} has members 0 to {len(members) - 1}, member {member} was asked for"
-        )
-    check_sound(directory, member)
-    params = jax.tree.map(lambda leaf: leaf[member], load_params(directory))
+    source = load_source(directory, member)
+    spec, params, chosen = source.spec, source.params, source.spec.members[member]
     for name, leaf in transfer.flatten(params).items():
         if not np.all(np.isfinite(leaf)):
             raise ValueError(f"{name} of member {member} of {directory} is not finite")
@@ -72,8 +64,8 @@ def export(
     transfer.save(path, params)
     card = Card(
         spec=spec,
-        seed=members[member].seed,
-        label=members[member].label,
+        seed=chosen.seed,
+        label=chosen.label,
         environment_steps=steps,
         updates=counters["updates"],
         curves=_curves(directory, member, steps),
