@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from envs.brax_chain import (
@@ -29,9 +28,8 @@ from envs.brax_chain import (
     rotation_of,
 )
 
-_PLANE, _SPHERE, _CAPSULE = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE")
-)
+# MuJoCo's numbers of these kinds of geometries.
+_PLANE, _SPHERE, _CAPSULE = 0, 2, 3
 
 # The floor's normal, and one side of a point's frame where no capsule lies.
 _UP, _ACROSS = np.eye(3, dtype=np.float32)[[2, 1]]
@@ -95,6 +93,8 @@ class Forces:
 
     def _points(self, system) -> None:
         """Where links can touch the floor, which is the one thing that they can touch."""
+        from mujoco import mjx
+
         points, floor, kinds = [], -1, np.asarray(system.geom_type)
         bodies, sizes = np.asarray(system.geom_bodyid), np.asarray(system.geom_size)
         touches = np.asarray(system.geom_contype)[:, None] & np.asarray(system.geom_conaffinity)
@@ -116,7 +116,7 @@ class Forces:
                 end = place + side * axis * sizes[other, 1]
                 points.append(_Point(int(bodies[other]) - 1, end, radius, axis, friction))
         known = len(points)
-        expected = int(mujoco.mjx.make_data(system)._impl.ncon)
+        expected = int(mjx.make_data(system)._impl.ncon)
         one_kind = all(
             len(np.unique(np.asarray(x), axis=0)) == 1
             for x in (system.geom_solref, system.geom_solimp, system.geom_priority)

@@ -449,6 +449,30 @@ def test_a_phase_hangs_at_first_and_repeats_to_the_bit_after_others(env):
     assert same(phase(0), (start, record))
 
 
+def test_a_step_from_before_a_phase_is_its_reset(env):
+    """Whatever the action; the tick after it too."""
+    slots, keys = jnp.arange(2), jax.random.split(jax.random.key(0), 2)
+
+    @jax.jit
+    def both(actions):
+        state, start = jax.vmap(env.reset)(slots, keys)
+        other, begun = jax.vmap(env.step)(jax.vmap(env.before)(slots, keys), actions)
+        return (
+            (state, start),
+            (other, begun),
+            *(jax.vmap(env.step)(x, actions)[1] for x in (state, other)),
+        )
+
+    (state, start), (other, begun), after, later = both(jnp.array([[0.5], [-1.0]]))
+    for name in ("slot", "key", "episode", "ended"):
+        np.testing.assert_array_equal(getattr(state, name), getattr(other, name))
+    assert start.first.all() and not after.first.any()
+    for one, two in ((start, begun), (after, later)):
+        np.testing.assert_array_equal(one.first, two.first)
+        np.testing.assert_allclose(one.reward, two.reward, atol=1e-5)
+        assert psnr(one.image, two.image).min() > 40
+
+
 FRESH_PROCESS = """
 import hashlib, sys, jax, envs
 from test_brax import SWINGUP, phase_of
