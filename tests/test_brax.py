@@ -26,7 +26,9 @@ from dreamer_jax import device_replay
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.device_round import whole_round
-from dreamer_jax.population import init_members, zero_sums
+from dreamer_jax.diagnosis import diagnose
+from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.rollout import collect
 from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
 from envs.mixed import MixedEnv
@@ -500,29 +502,59 @@ def test_environments_say_whether_they_have_a_host(env, hosted):
     assert not MixedEnv([env, env], [[0], [1]], 2).has_host
 
 
-def test_a_whole_round_of_several_tasks_is_one_program_without_a_host(brax_pixels):
-    """P = 2 members of K = 2 tasks: collecting, storing, sampling and updating."""
+@pytest.fixture(scope="module")
+def programs(brax_pixels):
+    """What a run of P = 1 compiles, by name, as text: its phase of all six tasks, and of K = 2 the
+    round that is one program, the update and the diagnosis."""
     agent = Agent(preset("debug"), 1)
-    made = envs.make([SWINGUP, "brax/inverted_double_pendulum"], members=2, image_size=32)
-    state = jax.eval_shape(lambda: init_members(agent, jnp.arange(2)))
+    made = envs.make([SWINGUP, "brax/inverted_double_pendulum"], members=1, image_size=32)
+    state = jax.eval_shape(lambda: init_members(agent, jnp.arange(1)))
     sums = jax.eval_shape(lambda: zero_sums(agent, state, 2, 5))
-    held = jax.eval_shape(lambda: device_replay.empty(2, 2, 42, 32, 1))
-    drawn = jax.ShapeDtypeStruct((4, 2, 2), jnp.int32)
-    number = jax.ShapeDtypeStruct((), jnp.int32)
-    program = whole_round.lower(
-        agent, made, state, sums, held, jnp.arange(2), number, number, number, (drawn, drawn),
-        ticks=20, length=5, mapping="auto", chunk=1,
-    ).as_text()  # fmt: skip
-    assert "callback" not in program and program.count("func.func public") == 1
+    held = jax.eval_shape(lambda: device_replay.empty(1, 2, 42, 32, 1))
+
+    def records(*lead):
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*lead, *x.shape[3:]), x.dtype), held)
+
+    drawn, number = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((4, 1, 2), ()))
+    seeds, mapped = jnp.arange(1), {"mapping": "auto", "chunk": 1}
+    every = envs.make(NAMES, members=1, image_size=32)
+    padded = Agent(preset("debug"), every.action_size)
+    params = jax.eval_shape(lambda: init_members(padded, jnp.arange(1))).params
+
+    def phases(params, updates, number, mode):
+        return collect(
+            padded, every, params, seeds, updates, number, tasks=len(NAMES), ticks=20, mode=mode
+        )
+
+    lowered = {
+        "round": whole_round.lower(
+            agent, made, state, sums, held, seeds, number, number, number, (drawn, drawn),
+            ticks=20, length=5, **mapped,
+        ),
+        "collect": jax.jit(phases).lower(params, state.updates, number, number),
+        "update": update_members.lower(agent, state, sums, records(1, 2, 5), **mapped),
+        "diagnose": diagnose.lower(agent, state.params, records(1, 2, 21), seeds, number),
+    }  # fmt: skip
+    return {name: program.as_text() for name, program in lowered.items()}
+
+
+@pytest.mark.parametrize("name", ["round", "collect", "update", "diagnose"])
+def test_no_program_of_a_run_calls_the_host(programs, name):
+    assert "callback" not in programs[name] and len(programs[name]) > 10_000
+
+
+def test_a_whole_round_of_several_tasks_is_one_program_that_reuses_its_memory(programs):
+    """Collecting, storing, sampling and updating."""
+    program = programs["round"]
+    assert program.count("func.func public") == 1
     assert "jax.buffer_donor" in program or "tf.aliasing_output" in program
 
 
-def test_no_host_is_part_of_a_phase(env, hosted):
+def test_no_host_is_part_of_a_phase_unless_mujoco_draws(env, hosted):
     def program(made):
         return phase_of(made, tasks=1, ticks=30).phase.lower(jax.random.key(0))
 
     assert "callback" in program(hosted).as_text()
-    assert "callback" not in program(env).as_text()
     assert "callback" not in program(env).compile().as_text()
 
 
