@@ -15,7 +15,7 @@ from experiments.reports.classification import Classification, Share
 from experiments.reports.outcomes import read_outcomes
 from experiments.thesis import grid
 from experiments.thesis.contradictions import CONTRADICTIONS
-from experiments.thesis.grid import FIGURES, TABLES
+from experiments.thesis.grid import FIGURES, TABLES, ReturnsTable
 from made_up_results import baselines, rising, targets, write_folder
 
 SEEDS = (0, 1, 2, 3, 4)
@@ -45,7 +45,7 @@ def classified(table):
     shares = tuple(
         Share(threshold, scaled, task, task in table.known, 0.25, 0.75, 0.5)
         for threshold, scaled in ((50.0, 5.0), (70.0, 7.0), (90.0, 9.0), (None, 6.5))
-        for task in (*table.targets, *table.known)
+        for task in table.tasks
     )
     return Classification(table, 100, 23, shares)
 
@@ -116,7 +116,7 @@ def test_a_page_answers_first(text):
 
 
 def test_a_forest_plot_has_zero_and_the_interval_on_one_scale(root):
-    tables = [table for table in TABLES.values() if table.kind != "ltc"]
+    tables = [table for table in TABLES.values() if isinstance(table, ReturnsTable)]
     cells = [cell for table in tables for cell in grid.shown(table, SEEDS)]
     (finding,) = findings.findings(tables, read_outcomes(root, cells), SEEDS)
     part = page._forest("", finding.comparisons["overall"][TARGET])

@@ -3,12 +3,12 @@
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
-import dataclasses
 import functools
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -17,7 +17,12 @@ from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
 from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
 from experiments.thesis import grid
-from experiments.thesis.grid import Backend, Figure, Table
+from experiments.thesis.grid import Backend, Figure, LatentTable, Shown, Table
+
+if TYPE_CHECKING:
+    from experiments.thesis.graph import Graph, PlannedRun
+    from experiments.thesis.speeds import Known
+    from experiments.thesis.sweep import Progress
 
 
 @dataclass(frozen=True)
@@ -121,9 +126,7 @@ def plan_defaults(base: Base) -> Plan:
     return Plan(sweep=_sweep(base))
 
 
-def chosen(
-    entries: Mapping[str, Table | Figure], names: Sequence[str], backend: Backend
-) -> list[Table | Figure]:
+def chosen(entries: Mapping[str, Shown], names: Sequence[str], backend: Backend) -> list[Shown]:
     """The tables or figures of the given numbers, on a backend.
 
     Raises:
@@ -150,7 +153,8 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    return _make([_beside(entry, command.sweep) for entry in entries], command.sweep)
+    compared = command.sweep.compared
+    return _make([grid.beside(entry, compared) for entry in entries], command.sweep)
 
 
 def figures(command: Figures) -> int:
@@ -160,21 +164,7 @@ def figures(command: Figures) -> int:
     return _make(entries, command.sweep)
 
 
-def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
-    """A table or figure of the fractions and numbers of source tasks that are asked for."""
-    omegas = tuple(omega for omega in entry.omegas if omega in sweep.omegas)
-    counts = tuple(count for count in entry.counts if count in sweep.counts)
-    return dataclasses.replace(entry, omegas=omegas, counts=counts)
-
-
-def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
-    """A table of fractional transfer with the methods of comparison that are asked for."""
-    if isinstance(entry, Table) and entry.kind == "ftl":
-        return dataclasses.replace(entry, compared=sweep.compared)
-    return entry
-
-
-def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
+def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
     """The runs behind tables and figures."""
     from experiments.thesis.graph import plan_runs
 
@@ -187,14 +177,13 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
-        if not set(sweep.compared) <= set(grid.COMPARED):
-            raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
-        entries = [_restricted(entry, sweep) for entry in entries]
+        grid.check_compared(sweep.compared)
+        entries = [grid.restricted(entry, sweep.omegas, sweep.counts) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
         return plan_runs(cells, sweep.config, sweep.root)
 
 
-def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
+def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep) -> "tuple[Graph, Progress]":
     """Trains what is missing of tables and figures.
 
     Returns:
@@ -204,10 +193,11 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
       UsageError: results of other settings are there, or a simulator is not installed.
     """
     from dreamer_jax.host_memory import keep_freed_memory
+    from experiments.thesis.graph import due
     from experiments.thesis.sweep import carry_out_runs, train
 
     runs = _planned(entries, sweep)
-    if any(run.state in ("missing", "cut") for run in runs):
+    if due(runs):
         keep_freed_memory()
     trains = functools.partial(train, accept_failed=sweep.accept_failed)
     with usage_errors():
@@ -217,7 +207,7 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     return runs, progress
 
 
-def _tell_problems(progress) -> int:
+def _tell_problems(progress: "Progress") -> int:
     """Names what was not trained.
 
     Returns:
@@ -232,17 +222,19 @@ def _tell_problems(progress) -> int:
 def plan(command: Plan) -> int:
     """Shows the graph with an estimate."""
     from experiments.thesis import estimate
+    from experiments.thesis.graph import due
 
     sweep = command.sweep
     with usage_errors():
         if not (command.table or command.figure):
             raise ValueError("nothing to plan: add --table 3, or --figure 12, or all of them")
-        entries = [
+        entries: list[Table | Figure] = [
             *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
             *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
         ]
-    runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
-    known = _speed(runs, again=command.measure)
+    runs = _planned([grid.beside(entry, sweep.compared) for entry in entries], sweep)
+    left = due(runs)
+    known = _speed(left, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed))
     if known is not None:
@@ -265,43 +257,39 @@ LONG_SECONDS = 3600.0
 """What takes longer is begun at a terminal only after a question."""
 
 
-def _speed(runs, again: bool = False):
-    """How fast this machine is at the runs that are due; None if none is."""
-    from experiments.thesis.estimate import DUE
+def _speed(left: "Sequence[PlannedRun]", again: bool = False) -> "Known":
+    """How fast this machine is at runs of which there is at least one."""
     from experiments.thesis.speeds import cache_folder, speed_of
-
-    due = [run.spec for run in runs if run.state in DUE]
-    if not due:
-        return None
 
     def report(number: int, count: int, what: str) -> None:
         if number == 1:
             print("measuring how fast this machine is:", file=sys.stderr)
         print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
 
-    return speed_of(due, cache_folder(), again=again, report=report)
+    return speed_of([run.spec for run in left], cache_folder(), again=again, report=report)
 
 
-def _may_begin(runs) -> bool:
+def _may_begin(runs: "Graph") -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
+    from experiments.thesis.graph import due
 
-    due = [run for run in runs if run.state in estimate.DUE]
+    left = due(runs)
     updates = sum(
         Schedule(run.spec.config.schedule, len(run.spec.tasks)).updates * len(run.spec.members)
-        for run in due
+        for run in left
     )
     # An update that takes a second is one of the largest sizes on a machine without accelerator.
     if updates < LONG_SECONDS:
         return True
-    speed = _speed(runs).speed
+    speed = _speed(left).speed
     total = estimate.together(runs, speed)
     if total.seconds < LONG_SECONDS:
         return True
-    agents = sum(len(run.cells) for run in due)
+    agents = sum(len(run.cells) for run in left)
     print(
-        f"{len(due)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
+        f"{len(left)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
         "They can be stopped with\nCtrl-C and go on with the same command; plan shows them one by "
         "one, --yes begins without asking."
     )
@@ -325,7 +313,7 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
         return STOPPED
     run_of = {cell: run.name for run in runs for cell in run.cells}
     for entry in entries:
-        if entry.kind != "ltc":
+        if not isinstance(entry, LatentTable):
             continue
         (cell,) = grid.shown(entry, sweep.seeds)
         if (name := run_of[cell.name]) in progress.failed | progress.skipped:

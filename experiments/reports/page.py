@@ -40,7 +40,16 @@ from experiments.runs.folder import CELLS, latents_folder
 from experiments.runs.folder import folders as places
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
-from experiments.thesis.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
+from experiments.thesis.grid import (
+    FIGURES,
+    TABLES,
+    TASKS,
+    Backend,
+    Cell,
+    Figure,
+    LatentTable,
+    ReturnsTable,
+)
 
 LARGEST_VIDEOS = 16 * 2**20
 """Bytes of all videos together; what does not fit is left out and named."""
@@ -115,7 +124,7 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
     cells = grid.closure(asked)
     # What is not comparable is said at the top, once.
     runs, outcomes, size = read_runs(root), read_outcomes(root, cells), size_note(root)
-    returns = [table for table in tables if table.kind != "ltc"]
+    returns = [table for table in tables if isinstance(table, ReturnsTable)]
     shown = [
         folded(table.name, returns_sheet(table, outcomes, seeds, None))
         for table in returns
@@ -124,7 +133,8 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
     classified = [
         (folded(table.name, classification_sheet(table, found, None)), _latents(table, root, seeds))
         for table in tables
-        if table.kind == "ltc" and (found := read_classification(root, table, seeds)) is not None
+        if isinstance(table, LatentTable)
+        and (found := read_classification(root, table, seeds)) is not None
     ]
     curves = [
         _curves(figure, outcomes, seeds)
@@ -134,20 +144,25 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
     tasks = [_tasks(figure) for figure in pictures if figure.kind == "tasks"]
     together = _together(returns, outcomes, seeds)
     videos, left_out = _films(runs)
-    there = {one.name for one in (*shown, *curves, *tasks)} | {one.name for one, _ in classified}
     folders, versions = _provenance(root, runs)
     state = states(outcomes.values())
     evaluations = sum(len(outcome.env_steps) for outcome in outcomes.values())
+    named = {
+        "tables": [one.name for one in shown],
+        "ltc": [one.name for one, _ in classified],
+        "curves": [one.name for one in curves],
+        "tasks": [one.name for one in tasks],
+    }
     sections = [
         ("tables", "Tables", shown),
-        ("ltc", "Latent task classification", [one for one, _ in classified]),
+        ("ltc", "Latent task classification", classified),
         ("curves", "Learning curves", curves),
-        ("together", "All targets together", together and ()),
-        ("videos", "Videos", (videos or left_out) and ()),
+        ("together", "All targets together", together),
+        ("videos", "Videos", videos or left_out),
         ("tasks", "The tasks", tasks),
-        ("reading", "How to read this", ()),
-        ("contradictions", "Contradictions of the thesis", ()),
-        ("provenance", "Where the numbers come from", ()),
+        ("reading", "How to read this", True),
+        ("contradictions", "Contradictions of the thesis", True),
+        ("provenance", "Where the numbers come from", True),
     ]
     return {
         "style": Path(__file__).with_name("page.css").read_text(encoding="utf-8"),
@@ -166,14 +181,18 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
         "least_seeds": LEAST_SEEDS,
         "statistics_caption": STATISTICS_CAPTION,
         "contents": [
-            ({"id": id, "text": text}, [(one.name, one.name.replace("-", " ")) for one in entries])
-            for id, text, entries in sections
-            if entries or (entries == () and id not in ("tables", "ltc", "curves"))
+            ({"id": id, "text": text}, [(x, x.replace("-", " ")) for x in named.get(id, ())])
+            for id, text, there in sections
+            if there
         ],
         "tables": shown,
         "classification": classified,
         "curves": curves,
-        "not_run": not_run(one.name for one in (*tables, *pictures) if one.name not in there),
+        "not_run": not_run(
+            one.name
+            for one in (*tables, *pictures)
+            if not any(one.name in names for names in named.values())
+        ),
         "together": together,
         "films": videos,
         "films_left_out": left_out,
@@ -275,7 +294,7 @@ def _forest(title: str, comparisons: Sequence[Comparison]) -> dict[str, Any]:
 
     rows = []
     for one in comparisons:
-        transfer = one.entry.transfer
+        transfer = one.transfer
         value, low, high = transfer.difference
         rows.append(
             {
@@ -319,7 +338,7 @@ def _tasks(figure: Figure) -> Picture:
         return Picture(figure.name, caption, _data("image/png", picture))
 
 
-def _latents(table: Table, root: Path, seeds: Sequence[int]) -> Picture | None:
+def _latents(table: LatentTable, root: Path, seeds: Sequence[int]) -> Picture | None:
     """The picture of latent states that classification leaves beside its numbers, if it has."""
     picture = latents_folder(root, table.backend, seeds[0]) / f"{table.name}.png"
     if not picture.exists():
@@ -360,7 +379,7 @@ def _film_name(film: Film) -> str:
 
 
 def _together(
-    tables: Sequence[Table], outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
+    tables: Sequence[ReturnsTable], outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
 ) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
     """Each setting of a method over all targets all of whose agents are there: title, targets and
     rows of each method and metric that has any."""
@@ -393,7 +412,8 @@ def _provenance(
     root: Path, runs: Mapping[Path, Run]
 ) -> tuple[list[tuple[str, str, str, str, str]], list[str]]:
     """Each results folder: its agents, evaluations, revision and number of versions; and these."""
-    rows, versions = [], {}
+    rows: list[tuple[str, str, str, str, str]] = []
+    versions: dict[str, int] = {}
     for folder in sorted({path.parent for path in root.glob(f"*/{CELLS}")}):
         if folder not in runs:
             rows.append((folder.name, "-", "-", "cannot be read", "-"))

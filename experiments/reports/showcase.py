@@ -65,10 +65,12 @@ def effects(run: Run, task: str) -> list[Effect]:
         reached = np.flatnonzero(curve.mean(axis=0) >= last)
         told.append(
             Effect(
-                label,
-                *(float(x[i]) for x in (found.value, found.low, found.high)),
-                verdicts.verdict(found.value[i], corrected[i]) if enough else None,
-                int(steps[reached[0]]) if len(reached) else None,
+                label=label,
+                difference=float(found.value[i]),
+                low=float(found.low[i]),
+                high=float(found.high[i]),
+                verdict=verdicts.verdict(found.value[i], corrected[i]) if enough else None,
+                reached=int(steps[reached[0]]) if len(reached) else None,
             )
         )
     return told

@@ -142,8 +142,9 @@ def classify(
         actors=actors,
         policy=policy,
     )
-    players = [(actor, (task,)) for actor, task in zip(actors, tasks, strict=False)]
-    players = players or [(source, tasks)]
+    players: list[tuple[Source, tuple[str, ...]]] = [
+        (actor, (task,)) for actor, task in zip(actors, tasks, strict=False)
+    ] or [(source, tasks)]
     gathered: dict[str, Latents] = {}
     for number, (actor, played) in enumerate(players):
 
@@ -242,7 +243,7 @@ def table(outcome: Outcome) -> str:
     header = ["threshold"]
     header += [f"{called[task]}, novel" for task in outcome.novel]
     header += [called[task] for task in outcome.known]
-    rows = []
+    rows: list[list[str]] = []
     for threshold, accuracies in zip(outcome.thresholds, outcome.accuracies, strict=True):
         suggested = len(rows) == len(outcome.thresholds) - 1
         row = [f"{threshold:.4g}" + (" (suggested)" if suggested else "")]
@@ -257,7 +258,8 @@ def table(outcome: Outcome) -> str:
 
 def distance_table(outcome: Outcome) -> str:
     """Distances to the nearest fitted sample, and what the neighbours took each task for."""
-    rows, called = [], titles(outcome.tasks)
+    rows: list[list[str]] = []
+    called = titles(outcome.tasks)
     for task in outcome.tasks:
         distances = outcome.distances[task]
         votes = ", ".join(f"{called[name]} {n}" for name, n in outcome.votes[task].most_common())

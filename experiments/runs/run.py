@@ -29,8 +29,8 @@ from experiments.runs.start import load_sources, transferred_members
 
 
 def _versions() -> dict[str, str]:
-    names = ("jax", "jaxlib", "flax", "optax", "numpy", "pillow")
-    names += ("gymnasium", "pygame", "pybullet", "brax", "mujoco")
+    names = ["jax", "jaxlib", "flax", "optax", "numpy", "pillow"]
+    names += ["gymnasium", "pygame", "pybullet", "brax", "mujoco"]
     versions = {"python": platform.python_version(), "backend": jax.default_backend()}
     for name in names:
         try:

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import jax
@@ -29,7 +29,7 @@ from experiments.runs.agents import make_agent
 from experiments.runs.spec import RunSpec, action_size
 from experiments.runs.text import aligned
 from experiments.thesis import flops
-from experiments.thesis.graph import PlannedRun
+from experiments.thesis.graph import Graph, PlannedRun, due
 
 SAMPLE_OPERATIONS = 1e11
 """An update that does no more than this is measured as it is."""
@@ -42,8 +42,6 @@ UPDATE_SECONDS, TICKS, MEMORY_SHARE, CHECKPOINTS = 2.0, 50, 0.8, 2
 SLACK = 1.5
 """How much longer a run may take than what is counted of it."""
 NAME_COLUMNS = 30
-DUE = ("missing", "cut")
-"""States of the runs that still take time."""
 
 
 @dataclass(frozen=True)
@@ -344,14 +342,14 @@ def in_memory(spec: RunSpec) -> RunSpec:
     return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
 
 
-def together(runs: Sequence[PlannedRun], speed: Speed | None) -> Estimate:
+def together(runs: Graph, speed: Speed) -> Estimate:
     """What all runs still take: time and disk add up, of memory the largest counts.
 
     Args:
       runs: from `graph.plan_runs`; they come one after another.
-      speed: from `measure`; not needed if nothing is missing.
+      speed: from `measure`.
     """
-    each = [estimate(run, speed) for run in runs if run.state in DUE]
+    each = [estimate(run, speed) for run in due(runs)]
     return Estimate(
         sum(one.seconds for one in each),
         max((one.memory for one in each), default=0),
@@ -359,26 +357,30 @@ def together(runs: Sequence[PlannedRun], speed: Speed | None) -> Estimate:
     )
 
 
-def plan_table(runs: Sequence[PlannedRun], speed: Speed | None) -> str:
+def plan_table(runs: Graph, speed: Speed | None) -> str:
     """The graph as a table: a row for each run, which names those it needs by number, and totals.
 
     At most 100 columns wide: names that are longer go on in further lines.
 
     Args:
       runs: from `graph.plan_runs`.
-      speed: from `measure`; not needed if nothing is missing.
+      speed: from `measure`; without it nothing is said of time, memory and disk.
     """
     rows = []
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
+    words = (
+        {}
+        if speed is None
+        else {run.name: _in_words(estimate(run, speed), speed) for run in due(runs)}
+    )
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
         needs = ",".join(numbers.get(name, "?") for name in run.needs) or "-"
         first, *more = _lines(run.name)
         row = [f"{numbers[run.name]:>2}  {first}", str(len(run.cells)), needs, state]
-        if run.state in DUE:
-            row += _in_words(estimate(run, speed), speed)
-        rows.append(row + ["-"] * (7 - len(row)))
-        told = [f"{len(run.failed)} failed"] if run.failed else []
+        rows.append(row + words.get(run.name, ["-"] * 3))
+        failed = len(run.failed) if isinstance(run, PlannedRun) else 0
+        told = [f"{failed} failed"] if failed else []
         for line, word in itertools.zip_longest(more, told, fillvalue=""):
             rows.append([f"      {line}", "", "", word, "", "", ""])
     agents = str(sum(len(run.cells) for run in runs))

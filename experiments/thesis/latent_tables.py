@@ -21,7 +21,7 @@ from experiments.runs import classify
 from experiments.runs.agents import load_source
 from experiments.runs.folder import folders, latents_folder
 from experiments.runs.latents import Latents, gather
-from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, Table, multitask
+from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, LatentTable, multitask
 from experiments.thesis.populations import task_name
 
 SAMPLES = 100
@@ -32,7 +32,7 @@ Drawn = Mapping[str, tuple[Latents, Latents]]
 
 def make_table(
     root: str | Path,
-    table: Table,
+    table: LatentTable,
     seed: int,
     *,
     workers: int | None = None,
@@ -44,7 +44,7 @@ def make_table(
 
     Args:
       root: the folder of all results.
-      table: of the kind "ltc".
+      table: which one.
       seed: of the agent, and of episodes and samples.
       workers: simulator processes; by default one per core.
       accept_failed: take an agent whose losses were not finite any more, as it was before.
@@ -69,7 +69,7 @@ def make_table(
         )
         _write(folder / "samples.npz", drawn)
     drawn = _read(folder / "samples.npz", tuple(names.values()))
-    tasks = tuple(names[title] for title in (*table.targets, *table.known))
+    tasks = tuple(names[title] for title in table.tasks)
     outcome = classify.judge(tasks, tuple(names[title] for title in table.known), drawn)
     classify.plot(outcome, folder / table.name)
     size = next(iter(drawn.values()))[0].features.shape[1]
@@ -118,13 +118,11 @@ def _write(path: Path, drawn: Drawn) -> None:
 def _read(path: Path, tasks: tuple[str, ...]) -> dict[str, tuple[Latents, Latents]]:
     try:
         with np.load(path) as arrays:
-            return {
-                task: tuple(
-                    Latents(*(arrays[f"{task}/{half}/{name}"] for name in Latents._fields))
-                    for half in ("fitted", "tested")
-                )
-                for task in tasks
-            }
+
+            def half(task: str, name: str) -> Latents:
+                return Latents(*(arrays[f"{task}/{name}/{field}"] for field in Latents._fields))
+
+            return {task: (half(task, "fitted"), half(task, "tested")) for task in tasks}
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path} is damaged ({error}): delete it, and its samples are gathered again"
