@@ -14,7 +14,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.progress import Report, unreported
-from dreamer_jax.randomness import EVALUATION_PHASES
+from dreamer_jax.randomness import EVALUATION_PHASES, prediction_key
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import Episode, collect, episodes
 from dreamer_jax.video import tile, write_video
@@ -203,7 +203,7 @@ def prediction_frames(agent: Agent, params, batch: Records) -> np.ndarray:
     Returns:
       uint8 [L, 3 * size, about P * size, 3].
     """
-    keys = jax.random.split(jax.random.key(0), batch.reward.shape[0])
+    keys = jax.vmap(prediction_key)(jnp.arange(batch.reward.shape[0]))
     predict = jax.jit(
         jax.vmap(lambda params, batch, key: agent.predict(params, batch, CONTEXT, key))
     )

@@ -19,7 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.progress import Report, unreported
-from dreamer_jax.randomness import LATENT_PHASES, latent_key
+from dreamer_jax.randomness import LATENT_PHASES, choice_generator, latent_key
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
 from dreamer_jax.waiting import to_host
@@ -47,7 +47,7 @@ class Latents(NamedTuple):
 
     def draw(self, samples: int, seed: int) -> "Latents":
         """S of them at random, each at most once."""
-        chosen = np.random.default_rng(seed).permutation(len(self.episodes))[:samples]
+        chosen = choice_generator(seed).permutation(len(self.episodes))[:samples]
         return Latents(self.features[chosen], self.episodes[chosen])
 
 
