@@ -72,7 +72,6 @@ def test_the_command_names_what_to_run_next(tmp_path, capsys):
         (["13"], "table-13 compares no returns"),
         (["99"], "unknown table '99'"),
         (["7", "--group", "1"], "a group has at least 2 seeds"),
-        (["7", "--compared", "luck"], "compared luck: must be some of fine-tuning, frozen-source"),
     ],
 )
 def test_what_cannot_be_answered_is_refused(arguments, message, capsys):

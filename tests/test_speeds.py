@@ -20,7 +20,7 @@ def measured(monkeypatch):
     """The tasks of each measurement that was asked for; each finds another speed."""
     found = []
 
-    def measure(specs, tell):
+    def measure(specs, tell, *, timeout):
         tasks = [task for spec in specs for task in spec.tasks]
         found.append(tasks)
         ticks = dict.fromkeys(tasks, 0.001 * len(found))

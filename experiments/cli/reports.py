@@ -11,7 +11,7 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import UsageError, usage_errors
-from experiments.cli.options import DEFAULT_PRESET, Preset
+from experiments.cli.options import DEFAULT_PRESET, Compared, Preset
 from experiments.cli.thesis import chosen
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, LatentTable, ReturnsTable, Table
@@ -57,7 +57,7 @@ class Seeds:
     """The fractions that are to be compared; the fewer, the fewer seeds they need."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """The numbers of source tasks that are to be compared."""
-    compared: tuple[str, ...] = ()
+    compared: tuple[Compared, ...] = ()
     """Further methods that are to be compared, see `table`."""
     backend: Backend = "bullet"
     """The simulators."""
@@ -170,7 +170,6 @@ def seeds(command: Seeds) -> int:
 
     with usage_errors():
         steps = looks(command.group, command.most)
-        grid.check_compared(command.compared)
         tables = []
         for table in chosen(grid.TABLES, command.names, command.backend):
             if isinstance(table, LatentTable):

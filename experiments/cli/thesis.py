@@ -15,7 +15,15 @@ import tyro
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
-from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
+from experiments.cli.options import (
+    DEFAULT_PRESET,
+    Base,
+    Compared,
+    ConfigFile,
+    Preset,
+    Simulators,
+    sequence,
+)
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, LatentTable, Shown, Table
 
@@ -40,13 +48,12 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
-    compared: tuple[str, ...] = ()
-    """Other methods to train, too, from the same sources (any of fine-tuning, frozen-source), for
-    rows of their own in tables of fractional transfer."""
+    compared: tuple[Compared, ...] = ()
+    """Other methods to train, too, from the same sources, for rows of their own in tables of
+    fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     yes: bool = False
     """At a terminal: begin without a question, however long it takes."""
     accept_failed: bool = False
@@ -177,7 +184,6 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
-        grid.check_compared(sweep.compared)
         entries = [grid.restricted(entry, sweep.omegas, sweep.counts) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
         return plan_runs(cells, sweep.config, sweep.root)
@@ -199,9 +205,13 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep) -> "tuple[Graph,
     runs = _planned(entries, sweep)
     if due(runs):
         keep_freed_memory()
-    trains = functools.partial(train, accept_failed=sweep.accept_failed)
+    trains = functools.partial(
+        train,
+        accept_failed=sweep.accept_failed,
+        timeout=sweep.simulators.simulator_timeout,
+    )
     with usage_errors():
-        progress = carry_out_runs(runs, sweep.root, workers=sweep.workers, train=trains)
+        progress = carry_out_runs(runs, sweep.root, workers=sweep.simulators.workers, train=trains)
     if progress.stopped:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
     return runs, progress
@@ -234,7 +244,8 @@ def plan(command: Plan) -> int:
         ]
     runs = _planned([grid.beside(entry, sweep.compared) for entry in entries], sweep)
     left = due(runs)
-    known = _speed(left, again=command.measure) if left else None
+    timeout = sweep.simulators.simulator_timeout
+    known = _speed(left, timeout, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed))
     if known is not None:
@@ -257,7 +268,7 @@ LONG_SECONDS = 3600.0
 """What takes longer is begun at a terminal only after a question."""
 
 
-def _speed(left: "Sequence[PlannedRun]", again: bool = False) -> "Known":
+def _speed(left: "Sequence[PlannedRun]", timeout: float, again: bool = False) -> "Known":
     """How fast this machine is at runs of which there is at least one."""
     from experiments.thesis.speeds import cache_folder, speed_of
 
@@ -266,10 +277,11 @@ def _speed(left: "Sequence[PlannedRun]", again: bool = False) -> "Known":
             print("measuring how fast this machine is:", file=sys.stderr)
         print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
 
-    return speed_of([run.spec for run in left], cache_folder(), again=again, report=report)
+    specs = [run.spec for run in left]
+    return speed_of(specs, cache_folder(), again=again, timeout=timeout, report=report)
 
 
-def _may_begin(runs: "Graph") -> bool:
+def _may_begin(runs: "Graph", timeout: float) -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
@@ -283,7 +295,7 @@ def _may_begin(runs: "Graph") -> bool:
     # An update that takes a second is one of the largest sizes on a machine without accelerator.
     if updates < LONG_SECONDS:
         return True
-    speed = _speed(left).speed
+    speed = _speed(left, timeout).speed
     total = estimate.together(runs, speed)
     if total.seconds < LONG_SECONDS:
         return True
@@ -305,9 +317,11 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
-    if not sweep.yes and sys.stdin.isatty() and not _may_begin(_planned(entries, sweep)):
-        print("nothing was begun")
-        return STOPPED
+    if not sweep.yes and sys.stdin.isatty():
+        timeout = sweep.simulators.simulator_timeout
+        if not _may_begin(_planned(entries, sweep), timeout):
+            print("nothing was begun")
+            return STOPPED
     runs, progress = _carry_out(entries, sweep)
     if progress.stopped:
         return STOPPED
@@ -325,7 +339,8 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
                     sweep.root,
                     entry,
                     sweep.seeds[0],
-                    workers=sweep.workers,
+                    workers=sweep.simulators.workers,
+                    timeout=sweep.simulators.simulator_timeout,
                     accept_failed=sweep.accept_failed,
                     report=report,
                 )

@@ -112,6 +112,7 @@ def classify(
     actors: Sequence[Source] = (),
     seed: int = 0,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     report: Report = unreported,
 ) -> Outcome:
     """Fits a classifier on samples of known tasks, and tests it on others of all tasks.
@@ -124,7 +125,7 @@ def classify(
       thresholds: ξ; by default the thesis's, scaled to the agent's M.
       neighbours: votes.
       quantile: share of known samples that the suggested threshold should hold.
-      features, policy, workers: see `latents.gather`.
+      features, policy, workers, timeout: see `latents.gather`.
       actors: with the policy "trained", one agent for each task; by default the source.
       seed: of episodes, draws and posterior samples.
       report: called after each phase; it counts those of all players.
@@ -160,6 +161,7 @@ def classify(
             actor=actor,
             features=features,
             workers=workers,
+            timeout=timeout,
             report=of_all,
         )
         gathered |= dict(zip(played, found, strict=True))

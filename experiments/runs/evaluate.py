@@ -90,18 +90,25 @@ def evaluate(
     return rows
 
 
-def play(agents: Agents, number: int = 0, *, workers: int | None = None) -> Records:
+def play(
+    agents: Agents,
+    number: int = 0,
+    *,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+) -> Records:
     """One phase of every member on every task: the mode, without noise.
 
     Args:
       agents: the population.
       number: of the phase; each has starts of its own, those of `evaluate`'s episodes.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
 
     Returns:
       NumPy leaves [P, K, T, ...].
     """
-    env = make_env(agents.spec, workers)
+    env = make_env(agents.spec, workers, timeout)
     try:
         return _played(make_agent(agents.spec), env, agents, number)
     finally:

@@ -161,7 +161,12 @@ def _scaled_bytes(agent: Agent, part: Agent, temporary: int) -> int:
     return int(fixed + (temporary - fixed) * records[0] / records[1])
 
 
-def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
+def measure(
+    specs: Iterable[RunSpec],
+    report: Report = unreported,
+    *,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+) -> Speed:
     """Measures the updates and the simulators of runs of one preset.
 
     A plain agent of the largest action size stands for all of them. An update that is large is
@@ -171,6 +176,7 @@ def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     Args:
       specs: the runs.
       report: called before each measurement with what it is of; it counts those begun.
+      timeout: seconds after which a simulator that does not answer is given up.
     """
     specs = tuple(specs)
     tasks = tuple(dict.fromkeys(task for spec in specs for task in spec.tasks))
@@ -196,7 +202,7 @@ def measure(specs: Iterable[RunSpec], report: Report = unreported) -> Speed:
     ticks = {}
     for number, task in enumerate(tasks, start=2):
         report(number, things, task)
-        ticks[task] = _tick_seconds(task, agent.config)
+        ticks[task] = _tick_seconds(task, agent.config, timeout)
     return Speed(
         update_seconds=middle,
         update_range=(fast, slow),
@@ -230,7 +236,7 @@ def _policy_seconds(agent: Agent, params) -> float:
     return (time.perf_counter() - started) / TICKS
 
 
-def _tick_seconds(task: str, config: Config) -> tuple[float, float]:
+def _tick_seconds(task: str, config: Config, timeout: float) -> tuple[float, float]:
     """Seconds for a tick of one simulator, what carries it to jitted code included, and seconds
     until the first."""
     env = envs.make(
@@ -239,6 +245,7 @@ def _tick_seconds(task: str, config: Config) -> tuple[float, float]:
         action_repeat=config.schedule.action_repeat,
         workers=1,
         supersample=config.schedule.supersample,
+        timeout=timeout,
     )
     try:
         made = time.perf_counter()

@@ -350,18 +350,6 @@ def may_be_compared() -> tuple[str, ...]:
     return tuple(name for name, method in methods.known().items() if method.COMPARED)
 
 
-def check_compared(names: Sequence[str]) -> None:
-    """Checks that tables may show methods beside their own.
-
-    Raises:
-      ValueError: one of them may not be; names those that may.
-    """
-    if strange := [name for name in names if name not in may_be_compared()]:
-        raise ValueError(
-            f"compared {', '.join(strange)}: must be some of {', '.join(may_be_compared())}"
-        )
-
-
 def beside(entry: Shown, compared: tuple[str, ...]) -> Shown:
     """A table of fractional transfer with rows of other methods; anything else as it is."""
     if isinstance(entry, ReturnsTable) and entry.kind == "ftl":

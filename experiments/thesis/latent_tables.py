@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+import envs
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.progress import Report, unreported
 from experiments.runs import classify
-from experiments.runs.agents import load_source
+from experiments.runs.agents import Source, load_source
 from experiments.runs.folder import folders, latents_folder
 from experiments.runs.latents import Latents, gather
 from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, LatentTable, multitask
@@ -36,6 +37,7 @@ def make_table(
     seed: int,
     *,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     accept_failed: bool = False,
     say: Callable[[str], Any] = print,
     report: Report = unreported,
@@ -47,6 +49,7 @@ def make_table(
       table: which one.
       seed: of the agent, and of episodes and samples.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
       accept_failed: take an agent whose losses were not finite any more, as it was before.
       say: where messages go.
       report: called after each round of gathering; it counts them.
@@ -64,9 +67,20 @@ def make_table(
     names = {title: task_name(table.backend, title) for title in TASKS}
     if not (folder / "samples.npz").exists():
         say(f"latent states of {len(names)} tasks: {folder}")
-        drawn = _gather(
-            root, table.backend, tuple(names.values()), seed, workers, accept_failed, report
+        source = _agent(root, table.backend, seed, accept_failed)
+        found = gather(
+            source,
+            tuple(names.values()),
+            classify.rounds(source, SAMPLES),
+            seed=seed,
+            workers=workers,
+            timeout=timeout,
+            report=report,
         )
+        drawn = {
+            task: classify.draw(latents, SAMPLES, seed)
+            for task, latents in zip(names.values(), found, strict=True)
+        }
         _write(folder / "samples.npz", drawn)
     drawn = _read(folder / "samples.npz", tuple(names.values()))
     tasks = tuple(names[title] for title in table.tasks)
@@ -78,26 +92,13 @@ def make_table(
     return path
 
 
-def _gather(
-    root: str | Path,
-    backend: Backend,
-    tasks: tuple[str, ...],
-    seed: int,
-    workers: int | None,
-    accept_failed: bool,
-    report: Report,
-) -> dict[str, tuple[Latents, Latents]]:
+def _agent(root: str | Path, backend: Backend, seed: int, accept_failed: bool) -> Source:
+    """The agent whose latent states are classified."""
     cell = multitask(backend, AUTOENCODER, seed)
     places = folders(root)
     if cell.name not in places:
         raise ValueError(f"the agent {cell.name!r} is not trained yet: its table trains it first")
-    source = load_source(*places[cell.name], accept_failed=accept_failed)
-    rounds = classify.rounds(source, SAMPLES)
-    found = gather(source, tasks, rounds, seed=seed, workers=workers, report=report)
-    return {
-        task: classify.draw(latents, SAMPLES, seed)
-        for task, latents in zip(tasks, found, strict=True)
-    }
+    return load_source(*places[cell.name], accept_failed=accept_failed)
 
 
 def _write(path: Path, drawn: Drawn) -> None:

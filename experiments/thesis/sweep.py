@@ -12,6 +12,7 @@ from typing import Literal
 
 import jax
 
+import envs
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.locks import FolderInUseError, FolderLock
@@ -50,9 +51,21 @@ Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
 
 
 def train(
-    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
+    run: PlannedRun,
+    root: Path,
+    workers: int | None,
+    *,
+    accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
+
+    Args:
+      run: which one.
+      root: the folder of all results.
+      workers: simulator processes; by default one per core.
+      accept_failed: transfer from agents that failed, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
@@ -73,6 +86,7 @@ def train(
             workers=workers,
             base=root,
             accept_failed=accept_failed,
+            timeout=timeout,
             lock=lock,
             cells=run.cells,
         )
