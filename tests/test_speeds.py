@@ -9,7 +9,7 @@ from experiments.cli import thesis
 from experiments.cli.main import main
 from experiments.runs.spec import RunSpec
 from experiments.thesis import speeds
-from experiments.thesis.estimate import Speed
+from experiments.thesis.measurement import Speed
 
 HOPPER = RunSpec(("bullet/hopper",), (0,), preset("debug"))
 ANT = RunSpec(("bullet/ant",), (0,), preset("debug"))

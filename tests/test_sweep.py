@@ -12,9 +12,10 @@ from envs import SimulatorError
 from experiments.runs.folder import folders
 from experiments.thesis import estimate
 from experiments.thesis import sweep as sweeps
-from experiments.thesis.estimate import Speed, plan_table
+from experiments.thesis.estimate import plan_table
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, closure, shown
+from experiments.thesis.measurement import Speed
 from experiments.thesis.sweep import carry_out_runs
 from runs import CONFIG, finish
 

@@ -231,7 +231,7 @@ def _tell_problems(progress: "Progress") -> int:
 
 def plan(command: Plan) -> int:
     """Shows the graph with an estimate."""
-    from experiments.thesis import estimate
+    from experiments.thesis import estimate, measurement
     from experiments.thesis.graph import due
 
     sweep = command.sweep
@@ -259,7 +259,7 @@ def plan(command: Plan) -> int:
         if known.speed.scaled > 1:
             print(
                 "The update was measured on smaller batches, and multiplied by "
-                f"{known.speed.scaled:.3g}: its time may be off by {estimate.SCALING_ERROR:.0%}."
+                f"{known.speed.scaled:.3g}: its time may be off by {measurement.SCALING_ERROR:.0%}."
             )
     return 0
 

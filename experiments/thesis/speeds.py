@@ -22,7 +22,7 @@ from dreamer_jax.progress import Report, unreported
 from envs import SIMULATOR_TIMEOUT
 from envs.pool import available_cores
 from experiments.runs.spec import RunSpec
-from experiments.thesis.estimate import Speed, measure
+from experiments.thesis.measurement import Speed, measure
 
 # Of the schedule, what a tick takes; the rest says how many there are.
 _OF_TICKS = ("action_repeat", "supersample", "phase_environment_steps")
