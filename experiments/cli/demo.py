@@ -11,6 +11,7 @@ from typing import Literal
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import STOPPED, usage_errors
+from experiments.cli.options import Devices
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Demo:
     """Settings; debug runs in seconds, from a source of its own sizes."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread the agents over, each agent on one of them."""
 
 
 def demo(command: Demo) -> int:
@@ -54,7 +57,7 @@ def demo(command: Demo) -> int:
         spec = RunSpec(
             (command.task,), command.seeds, configs.preset(command.preset), method=method
         )
-        run = make_run(spec, folder, resume=True, workers=command.workers)
+        run = make_run(spec, folder, resume=True, workers=command.workers, devices=command.devices)
     if carry_out(run) == "stopped":
         print(f"stopped and saved in {folder}: the same command goes on")
         return STOPPED

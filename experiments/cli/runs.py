@@ -23,6 +23,7 @@ from experiments.cli.options import (
     DEFAULT_PRESET,
     Base,
     ConfigFile,
+    Devices,
     Preset,
     make_method,
     method_defaults,
@@ -57,6 +58,9 @@ class Run:
     """Transfer from agents whose losses were not finite any more, as they were before."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread members over, each member on one of them. How many is no part of what a run
+    is: it goes on with more or fewer."""
     simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
     """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
     and ended."""
@@ -225,6 +229,7 @@ def train(command: Train) -> int:
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.workers,
+            devices=run.devices,
             accept_failed=run.accept_failed,
             timeout=run.simulator_timeout,
             from_checkpoint=run.from_checkpoint,

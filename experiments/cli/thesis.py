@@ -15,7 +15,7 @@ import tyro
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
-from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
+from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Devices, Preset, sequence
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, Table
 
@@ -42,6 +42,9 @@ class Sweep:
     """The folder of all results."""
     workers: int | None = setting(None, 1, 10_000)
     """Simulator processes; by default one per core."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread members over, each member on one of them. How many is no part of what a run
+    is: it goes on with more or fewer."""
     yes: bool = False
     """At a terminal: begin without a question, however long it takes."""
     accept_failed: bool = False
@@ -176,9 +179,11 @@ def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
 
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
     """The runs behind tables and figures."""
+    from dreamer_jax.devices import check_devices
     from experiments.thesis.graph import plan_runs
 
     with usage_errors():
+        check_devices(sweep.devices)
         if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
             raise ValueError(f"seeds {sweep.seeds} must be one or more, each named once")
         for name, wanted, there in (
@@ -209,7 +214,8 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
     runs = _planned(entries, sweep)
     if any(run.state in ("missing", "cut") for run in runs):
         keep_freed_memory()
-    trains = functools.partial(train, accept_failed=sweep.accept_failed)
+    options = {"accept_failed": sweep.accept_failed, "devices": sweep.devices}
+    trains = functools.partial(train, **options)
     with usage_errors():
         progress = carry_out_runs(runs, sweep.root, workers=sweep.workers, train=trains)
     if progress.stopped:
@@ -244,7 +250,7 @@ def plan(command: Plan) -> int:
     runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
     known = _speed(runs, again=command.measure)
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
-    print(estimate.plan_table(runs, known and known.speed))
+    print(estimate.plan_table(runs, known and known.speed, sweep.devices))
     if known is not None:
         ticks = 1000 * max(known.speed.tick_seconds.values())
         when = f"kept in {known.path} (--measure measures anew)" if known.kept else "here and now"
@@ -282,7 +288,7 @@ def _speed(runs, again: bool = False):
     return speed_of(due, cache_folder(), again=again, report=report)
 
 
-def _may_begin(runs) -> bool:
+def _may_begin(runs, devices: Devices) -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
@@ -296,7 +302,7 @@ def _may_begin(runs) -> bool:
     if updates < LONG_SECONDS:
         return True
     speed = _speed(runs).speed
-    total = estimate.together(runs, speed)
+    total = estimate.together(runs, speed, devices)
     if total.seconds < LONG_SECONDS:
         return True
     agents = sum(len(run.cells) for run in due)
@@ -317,7 +323,11 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
-    if not sweep.yes and sys.stdin.isatty() and not _may_begin(_planned(entries, sweep)):
+    if (
+        not sweep.yes
+        and sys.stdin.isatty()
+        and not _may_begin(_planned(entries, sweep), sweep.devices)
+    ):
         print("nothing was begun")
         return STOPPED
     runs, progress = _carry_out(entries, sweep)

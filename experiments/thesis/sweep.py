@@ -13,6 +13,7 @@ from typing import Literal
 import jax
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
+from dreamer_jax.devices import Choice
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.locks import FolderInUseError, FolderLock
 from dreamer_jax.record_checks import RecordsError
@@ -50,7 +51,11 @@ Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
 
 
 def train(
-    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
+    run: PlannedRun,
+    root: Path,
+    workers: int | None,
+    accept_failed: bool = False,
+    devices: Choice = "all",
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
@@ -64,10 +69,10 @@ def train(
         # Of a run that was stopped before anything was kept, perhaps one of other cells.
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec)
+        spec = in_memory(spec, devices)
     try:
         options = {"workers": workers, "base": root, "lock": lock, "cells": run.cells}
-        options["accept_failed"] = accept_failed
+        options |= {"accept_failed": accept_failed, "devices": devices}
         return carry_out(make_run(spec, folder, resume=True, **options))
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
