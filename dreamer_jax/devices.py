@@ -150,6 +150,8 @@ class Placement:
         if self.count < self.available:
             devices = f"{self.count} of {self.available} devices"
         members = f"{self.members} member{'s' if self.members > 1 else ''}"
+        if self.count == 1:
+            return f"{members} on {devices}"
         most = "at most " if self.padded > self.members else ""
         return f"{members} on {devices}, {most}{self.each} on each"
 

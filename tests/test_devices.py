@@ -111,8 +111,8 @@ def test_devices_of_an_accelerator_are_named_and_members_are_spread_evenly(monke
     there = [SimpleNamespace(platform="gpu") for _ in range(4)]
     monkeypatch.setattr(devices.jax, "local_devices", lambda: there)
     assert str(place(8)) == "8 members on 4 devices, 2 on each"
-    assert str(place(8, 1)) == "8 members on 1 of 4 devices, 8 on each"
-    assert str(place(1)) == "1 member on 1 of 4 devices, 1 on each"
+    assert str(place(8, 1)) == "8 members on 1 of 4 devices"
+    assert str(place(1)) == "1 member on 1 of 4 devices"
     assert str(place(10)) == "10 members on 4 devices, at most 3 on each"
     with pytest.raises(ValueError, match=r"has 4 \(gpu\): expected a whole number in \[1 to 4\]"):
         place(8, 5)
