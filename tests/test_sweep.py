@@ -227,7 +227,7 @@ def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for
     monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device])
     monkeypatch.setattr(
-        estimate, "_compiled_update", lambda _: [SimpleNamespace(memory_analysis=lambda: one)]
+        estimate, "_compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
     )
     schedule = estimate.in_memory(targets.spec).config.schedule
     expected = ("auto", 1) if chunk is None else ("chunks", chunk)

@@ -7,15 +7,13 @@ the byte, as one that was not.
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from dreamer_jax.checkpoint import Checkpointer
+from tests.faults.processes import start
 
-ROOT = Path(__file__).parents[2]
 LONG = ("--preset", "debug", "--environment-steps", "600", "--evaluate-every", "120")
 KINDS = {
     "one task": ("--task", "bullet/inverted_pendulum"),
@@ -42,19 +40,11 @@ class Outcome:
     different: list[str] = field(default_factory=list)
 
 
-def command(kind: str, out: Path, base: Path, *more: str) -> list[str]:
-    """The command that trains a run of a kind."""
+def arguments(kind: str, out: Path, base: Path) -> list[str]:
+    """The arguments of the command that trains a run of a kind, or goes on with it."""
     places = {"source": base / "one task", "uae": base / "uae"}
     words = [word.format(**places) for word in KINDS[kind]]
-    return [sys.executable, "-m", "experiments", "train", *words, *LONG, "--out", str(out), *more]
-
-
-def environment(cache: Path) -> dict[str, str]:
-    """Compiled functions are shared by all processes, and compiled quickly."""
-    settings = {"JAX_COMPILATION_CACHE_DIR": str(cache)}
-    settings |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1", "OMP_NUM_THREADS": "1"}
-    flags = os.environ.get("XLA_FLAGS") or "--xla_backend_optimization_level=0"
-    return os.environ | settings | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
+    return ["train", *words, *LONG, "--out", str(out), "--resume"]
 
 
 def train(kind: str, out: Path, base: Path, cache: Path) -> None:
@@ -63,16 +53,11 @@ def train(kind: str, out: Path, base: Path, cache: Path) -> None:
     Raises:
       RuntimeError: it failed; with its output.
     """
-    done = subprocess.run(
-        command(kind, out, base, "--resume"),
-        cwd=ROOT,
-        env=environment(cache),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise RuntimeError(f"{kind}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+    log = base / f"{out.name}.log"
+    process = start(arguments(kind, out, base), cache, log)
+    process.join()
+    if process.exitcode:
+        raise RuntimeError(f"{kind}: exit code {process.exitcode}\n{log.read_text()}")
 
 
 def workers(pid: int) -> list[int]:
@@ -89,26 +74,19 @@ def kill_once(
     Returns:
       Whether it was killed; not if it came to its end before.
     """
-    process = subprocess.Popen(
-        command(kind, out, base, "--resume"),
-        cwd=ROOT,
-        env=environment(cache),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    # Most of the time goes to starting: half of the kills wait for a sign of life.
+    process = start(arguments(kind, out, base), cache)
+    # Starting takes the larger part of the time, so most kills wait for a sign of life.
     if chance.random() < 0.8:
         before = _size(out)
-        while process.poll() is None and _size(out) == before:
+        while process.is_alive() and _size(out) == before:
             time.sleep(0.005)
         delay = chance.expovariate(1 / 1.5)
     else:
-        delay = chance.uniform(0, 20)
+        delay = chance.uniform(0, 10)
     deadline = time.monotonic() + delay
-    while process.poll() is None and time.monotonic() < deadline:
+    while process.is_alive() and time.monotonic() < deadline:
         time.sleep(0.002)
-    if process.poll() is not None:
+    if not process.is_alive():
         return False
     victims = workers(process.pid) if target != "trainer" else []
     for victim in [*victims[:1], *([process.pid] if target != "worker" else [])]:
@@ -118,7 +96,7 @@ def kill_once(
             pass
     if target == "worker" and not victims:  # none yet, or the physics is in the program
         process.kill()
-    process.wait()
+    process.join()
     return True
 
 

@@ -7,7 +7,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.faults.kills import ROOT, command, environment
+from tests.faults.kills import arguments, same
+from tests.faults.processes import start
 
 
 @contextmanager
@@ -37,22 +38,20 @@ def fill_disk(kind: str, base: Path, cache: Path, room: int) -> str | None:
         free = os.statvfs(disk).f_bavail * os.statvfs(disk).f_frsize
         filler.write_bytes(bytes(max(0, free - room * 1024)))
         out = disk / "run"
-        words = command(kind, out, base, "--resume")
-        process = subprocess.run(
-            words, cwd=ROOT, env=environment(cache), capture_output=True, text=True
-        )
-        if process.returncode == 0:
+        words, log = arguments(kind, out, base), base / f"disk of {room} KiB.log"
+        process = start(words, cache, log)
+        process.join()
+        said = log.read_text()
+        if process.exitcode == 0:
             return None
         filler.unlink()
-        again = subprocess.run(
-            words, cwd=ROOT, env=environment(cache), capture_output=True, text=True
-        )
-        if again.returncode:
+        again = start(words, cache)
+        again.join()
+        if again.exitcode:
             return None
-        error = process.stderr.strip().splitlines()[-1]
-        same = (out / "metrics.jsonl").read_bytes() == (base / kind / "metrics.jsonl").read_bytes()
-        clear = "Traceback" not in process.stderr and "No space left" in error
-        return error if same and clear else None
+        error = said.strip().splitlines()[-1]
+        clear = "Traceback" not in said and "No space left" in error
+        return error if clear and same(base / kind, out) is None else None
 
 
 def two_writers(kind: str, out: Path, base: Path, cache: Path) -> str | None:
@@ -61,14 +60,14 @@ def two_writers(kind: str, out: Path, base: Path, cache: Path) -> str | None:
     Returns:
       What the second one says, if the first one's result is as if it had been alone.
     """
-    words, settings = command(kind, out, base, "--resume"), environment(cache)
-    first = subprocess.Popen(
-        words, cwd=ROOT, env=settings, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    while first.poll() is None and not (out / ".lock").exists():
+    words, log = arguments(kind, out, base), base / "second writer.log"
+    first = start(words, cache)
+    while first.is_alive() and not (out / ".lock").exists():
         time.sleep(0.01)
-    second = subprocess.run(words, cwd=ROOT, env=settings, capture_output=True, text=True)
-    first.wait()
-    same = (out / "metrics.jsonl").read_bytes() == (base / kind / "metrics.jsonl").read_bytes()
-    told = second.returncode == 2 and f"process {first.pid} on" in second.stderr
-    return second.stderr.strip() if same and told and first.returncode == 0 else None
+    second = start(words, cache, log)
+    second.join()
+    first.join()
+    said = log.read_text().strip()
+    told = second.exitcode == 2 and f"process {first.pid} on" in said
+    alike = first.exitcode == 0 and same(base / kind, out) is None
+    return said if told and alike else None
