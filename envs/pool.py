@@ -125,12 +125,15 @@ class SimulatorPool:
         groups = min(-(-slots // self._share), count)
         self._locks = [threading.Lock() for _ in range(groups)]
         self._worker_of: dict[int, int] = {}
+        first = 0
         for group in range(groups):
-            own = range(group, count, groups)
             chosen = [slot for slot in range(slots) if self._group(slot) == group]
+            own = min(len(range(group, count, groups)), len(chosen))
             # Slots of one task go to different workers, for tasks differ in cost.
             by_task = sorted(chosen, key=lambda slot: self.tasks[slot].name)
-            self._worker_of |= {slot: own[i % len(own)] for i, slot in enumerate(by_task)}
+            self._worker_of |= {slot: first + i % own for i, slot in enumerate(by_task)}
+            first += own
+        count = first
 
         # With a core to spare, the pool waits awake, as its workers do; several threads would keep
         # one another from it.

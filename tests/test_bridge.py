@@ -236,6 +236,12 @@ def test_programs_have_workers_of_their_own_as_far_as_there_are_any(workers):
     assert max(len(of_one) for of_one in programs) == {1: 3, 2: 2, 5: 1}[workers]
 
 
+def test_no_worker_of_a_program_with_fewer_members_is_without_a_slot():
+    with env_of(fake("Counting"), members=7, workers=7, shards=3) as env:
+        hosted = [sorted(worker.tasks) for worker in env._pool._workers]
+    assert hosted == [[0], [1], [2], [3, 5], [4], [6]]
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_programs_that_play_at_once_do_not_mix_up_replies(workers):
     with env_of(fake("Counting"), members=4, workers=workers, shards=2) as env:
