@@ -244,7 +244,7 @@ def test_several_accelerators_work_at_once_and_each_has_memory_for_its_own(tmp_p
     monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device, device])
     monkeypatch.setattr(
-        estimate, "_compiled_update", lambda _: [SimpleNamespace(memory_analysis=lambda: one)]
+        estimate, "_compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
     )
     both = estimate.estimate(targets, fixed)
     assert both.seconds == alone.seconds / 2 and both.memory == alone.memory // 2
