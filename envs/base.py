@@ -12,6 +12,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+SIMULATOR_TIMEOUT = 300.0
+"""Seconds after which a simulator that does not answer is taken for stuck, unless told otherwise.
+"""
+
 
 @dataclass(frozen=True)
 class TaskSpec:
@@ -122,6 +126,17 @@ class Env(Protocol):
     def close(self) -> None:
         """Free what the environment holds. It cannot be used afterwards."""
         ...
+
+
+LEAST_SIZE = 8
+"""Height and width in pixels of the smallest pictures that are drawn of Brax's tasks."""
+
+
+def check_whole(what: str, value: Any, least: int) -> None:
+    """Raise a ValueError that begins with "got `what`" unless a value is a whole number of at least
+    `least`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"got {what}{value!r}, expected a whole number of at least {least}")
 
 
 class SimulatorError(RuntimeError):

@@ -12,9 +12,10 @@ from envs import SimulatorError
 from experiments.runs.folder import folders
 from experiments.thesis import estimate
 from experiments.thesis import sweep as sweeps
-from experiments.thesis.estimate import Speed, plan_table
+from experiments.thesis.estimate import plan_table
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, closure, shown
+from experiments.thesis.measurement import Speed
 from experiments.thesis.sweep import carry_out_runs
 from runs import CONFIG, finish
 
@@ -227,7 +228,7 @@ def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for
     monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device])
     monkeypatch.setattr(
-        estimate, "_compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
+        estimate, "compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
     )
     schedule = estimate.in_memory(targets.spec).config.schedule
     expected = ("auto", 1) if chunk is None else ("chunks", chunk)
@@ -244,7 +245,7 @@ def test_several_accelerators_work_at_once_and_each_has_memory_for_its_own(tmp_p
     monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device, device])
     monkeypatch.setattr(
-        estimate, "_compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
+        estimate, "compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
     )
     both = estimate.estimate(targets, fixed)
     assert both.seconds == alone.seconds / 2 and both.memory == alone.memory // 2

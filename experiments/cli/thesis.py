@@ -3,21 +3,35 @@
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
-import dataclasses
 import functools
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
-from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Devices, Preset, sequence
+from experiments.cli.options import (
+    DEFAULT_PRESET,
+    Base,
+    Compared,
+    ConfigFile,
+    Devices,
+    Preset,
+    Simulators,
+    sequence,
+)
 from experiments.thesis import grid
-from experiments.thesis.grid import Backend, Figure, Table
+from experiments.thesis.grid import Backend, Figure, LatentTable, Shown, Table
+
+if TYPE_CHECKING:
+    from experiments.thesis.graph import Graph, PlannedRun
+    from experiments.thesis.speeds import Known
+    from experiments.thesis.sweep import Progress
 
 
 @dataclass(frozen=True)
@@ -35,16 +49,15 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
-    compared: tuple[str, ...] = ()
-    """Other methods to train, too, from the same sources (any of fine-tuning, frozen-source), for
-    rows of their own in tables of fractional transfer."""
+    compared: tuple[Compared, ...] = ()
+    """Other methods to train, too, from the same sources, for rows of their own in tables of
+    fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
     devices: Devices = setting("all", 1, 10_000)
     """Devices to spread members over, each member on one of them. How many is no part of what a run
     is: it goes on with more or fewer."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     yes: bool = False
     """At a terminal: begin without a question, however long it takes."""
     accept_failed: bool = False
@@ -124,9 +137,7 @@ def plan_defaults(base: Base) -> Plan:
     return Plan(sweep=_sweep(base))
 
 
-def chosen(
-    entries: Mapping[str, Table | Figure], names: Sequence[str], backend: Backend
-) -> list[Table | Figure]:
+def chosen(entries: Mapping[str, Shown], names: Sequence[str], backend: Backend) -> list[Shown]:
     """The tables or figures of the given numbers, on a backend.
 
     Raises:
@@ -153,7 +164,8 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    return _make([_beside(entry, command.sweep) for entry in entries], command.sweep)
+    compared = command.sweep.compared
+    return _make([grid.beside(entry, compared) for entry in entries], command.sweep)
 
 
 def figures(command: Figures) -> int:
@@ -163,21 +175,7 @@ def figures(command: Figures) -> int:
     return _make(entries, command.sweep)
 
 
-def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
-    """A table or figure of the fractions and numbers of source tasks that are asked for."""
-    omegas = tuple(omega for omega in entry.omegas if omega in sweep.omegas)
-    counts = tuple(count for count in entry.counts if count in sweep.counts)
-    return dataclasses.replace(entry, omegas=omegas, counts=counts)
-
-
-def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
-    """A table of fractional transfer with the methods of comparison that are asked for."""
-    if isinstance(entry, Table) and entry.kind == "ftl":
-        return dataclasses.replace(entry, compared=sweep.compared)
-    return entry
-
-
-def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
+def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
     """The runs behind tables and figures."""
     from dreamer_jax.devices import check_devices
     from experiments.thesis.graph import plan_runs
@@ -192,14 +190,12 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
-        if not set(sweep.compared) <= set(grid.COMPARED):
-            raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
-        entries = [_restricted(entry, sweep) for entry in entries]
+        entries = [grid.restricted(entry, sweep.omegas, sweep.counts) for entry in entries]
         cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
         return plan_runs(cells, sweep.config, sweep.root)
 
 
-def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
+def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep) -> "tuple[Graph, Progress]":
     """Trains what is missing of tables and figures.
 
     Returns:
@@ -209,21 +205,26 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
       UsageError: results of other settings are there, or a simulator is not installed.
     """
     from dreamer_jax.host_memory import keep_freed_memory
+    from experiments.thesis.graph import due
     from experiments.thesis.sweep import carry_out_runs, train
 
     runs = _planned(entries, sweep)
-    if any(run.state in ("missing", "cut") for run in runs):
+    if due(runs):
         keep_freed_memory()
-    options = {"accept_failed": sweep.accept_failed, "devices": sweep.devices}
-    trains = functools.partial(train, **options)
+    trains = functools.partial(
+        train,
+        accept_failed=sweep.accept_failed,
+        timeout=sweep.simulators.simulator_timeout,
+        devices=sweep.devices,
+    )
     with usage_errors():
-        progress = carry_out_runs(runs, sweep.root, workers=sweep.workers, train=trains)
+        progress = carry_out_runs(runs, sweep.root, workers=sweep.simulators.workers, train=trains)
     if progress.stopped:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
     return runs, progress
 
 
-def _tell_problems(progress) -> int:
+def _tell_problems(progress: "Progress") -> int:
     """Names what was not trained.
 
     Returns:
@@ -237,18 +238,21 @@ def _tell_problems(progress) -> int:
 
 def plan(command: Plan) -> int:
     """Shows the graph with an estimate."""
-    from experiments.thesis import estimate
+    from experiments.thesis import estimate, measurement
+    from experiments.thesis.graph import due
 
     sweep = command.sweep
     with usage_errors():
         if not (command.table or command.figure):
             raise ValueError("nothing to plan: add --table 3, or --figure 12, or all of them")
-        entries = [
+        entries: list[Table | Figure] = [
             *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
             *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
         ]
-    runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
-    known = _speed(runs, again=command.measure)
+    runs = _planned([grid.beside(entry, sweep.compared) for entry in entries], sweep)
+    left = due(runs)
+    timeout = sweep.simulators.simulator_timeout
+    known = _speed(left, timeout, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed, sweep.devices))
     if known is not None:
@@ -262,7 +266,7 @@ def plan(command: Plan) -> int:
         if known.speed.scaled > 1:
             print(
                 "The update was measured on smaller batches, and multiplied by "
-                f"{known.speed.scaled:.3g}: its time may be off by {estimate.SCALING_ERROR:.0%}."
+                f"{known.speed.scaled:.3g}: its time may be off by {measurement.SCALING_ERROR:.0%}."
             )
     return 0
 
@@ -271,43 +275,40 @@ LONG_SECONDS = 3600.0
 """What takes longer is begun at a terminal only after a question."""
 
 
-def _speed(runs, again: bool = False):
-    """How fast this machine is at the runs that are due; None if none is."""
-    from experiments.thesis.estimate import DUE
+def _speed(left: "Sequence[PlannedRun]", timeout: float, again: bool = False) -> "Known":
+    """How fast this machine is at runs of which there is at least one."""
     from experiments.thesis.speeds import cache_folder, speed_of
-
-    due = [run.spec for run in runs if run.state in DUE]
-    if not due:
-        return None
 
     def report(number: int, count: int, what: str) -> None:
         if number == 1:
             print("measuring how fast this machine is:", file=sys.stderr)
         print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
 
-    return speed_of(due, cache_folder(), again=again, report=report)
+    specs = [run.spec for run in left]
+    return speed_of(specs, cache_folder(), again=again, timeout=timeout, report=report)
 
 
-def _may_begin(runs, devices: Devices) -> bool:
+def _may_begin(runs: "Graph", timeout: float, devices: Devices) -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
+    from experiments.thesis.graph import due
 
-    due = [run for run in runs if run.state in estimate.DUE]
+    left = due(runs)
     updates = sum(
         Schedule(run.spec.config.schedule, len(run.spec.tasks)).updates * len(run.spec.members)
-        for run in due
+        for run in left
     )
     # An update that takes a second is one of the largest sizes on a machine without accelerator.
     if updates < LONG_SECONDS:
         return True
-    speed = _speed(runs).speed
+    speed = _speed(left, timeout).speed
     total = estimate.together(runs, speed, devices)
     if total.seconds < LONG_SECONDS:
         return True
-    agents = sum(len(run.cells) for run in due)
+    agents = sum(len(run.cells) for run in left)
     print(
-        f"{len(due)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
+        f"{len(left)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
         "They can be stopped with\nCtrl-C and go on with the same command; plan shows them one by "
         "one, --yes begins without asking."
     )
@@ -323,19 +324,17 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
-    if (
-        not sweep.yes
-        and sys.stdin.isatty()
-        and not _may_begin(_planned(entries, sweep), sweep.devices)
-    ):
-        print("nothing was begun")
-        return STOPPED
+    if not sweep.yes and sys.stdin.isatty():
+        timeout = sweep.simulators.simulator_timeout
+        if not _may_begin(_planned(entries, sweep), timeout, sweep.devices):
+            print("nothing was begun")
+            return STOPPED
     runs, progress = _carry_out(entries, sweep)
     if progress.stopped:
         return STOPPED
     run_of = {cell: run.name for run in runs for cell in run.cells}
     for entry in entries:
-        if entry.kind != "ltc":
+        if not isinstance(entry, LatentTable):
             continue
         (cell,) = grid.shown(entry, sweep.seeds)
         if (name := run_of[cell.name]) in progress.failed | progress.skipped:
@@ -347,7 +346,8 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
                     sweep.root,
                     entry,
                     sweep.seeds[0],
-                    workers=sweep.workers,
+                    workers=sweep.simulators.workers,
+                    timeout=sweep.simulators.simulator_timeout,
                     accept_failed=sweep.accept_failed,
                     report=report,
                 )

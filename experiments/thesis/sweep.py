@@ -5,13 +5,14 @@ the next time.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import jax
 
+import envs
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 from dreamer_jax.devices import Choice
 from dreamer_jax.files import write_json_atomically
@@ -22,7 +23,7 @@ from envs import SimulatorError
 from experiments.runs.folder import CELLS, begun, set_aside
 from experiments.runs.run import carry_out, make_run
 from experiments.thesis.estimate import in_memory
-from experiments.thesis.graph import PlannedRun
+from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due
 
 
 @dataclass
@@ -54,10 +55,20 @@ def train(
     run: PlannedRun,
     root: Path,
     workers: int | None,
+    *,
     accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     devices: Choice = "all",
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
+
+    Args:
+      run: which one.
+      root: the folder of all results.
+      workers: simulator processes; by default one per core.
+      accept_failed: transfer from agents that failed, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many to spread its members over.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
@@ -71,16 +82,26 @@ def train(
         write_json_atomically(folder / CELLS, list(run.cells))
         spec = in_memory(spec, devices)
     try:
-        options = {"workers": workers, "base": root, "lock": lock, "cells": run.cells}
-        options |= {"accept_failed": accept_failed, "devices": devices}
-        return carry_out(make_run(spec, folder, resume=True, **options))
+        begins = make_run(
+            spec,
+            folder,
+            resume=True,
+            workers=workers,
+            base=root,
+            accept_failed=accept_failed,
+            timeout=timeout,
+            devices=devices,
+            lock=lock,
+            cells=run.cells,
+        )
+        return carry_out(begins)
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
 
 
 def carry_out_runs(
-    runs: Sequence[PlannedRun],
+    runs: Graph,
     root: str | Path,
     *,
     workers: int | None = None,
@@ -100,12 +121,12 @@ def carry_out_runs(
       ValueError: another process trains runs under the same root.
     """
     root, progress = Path(root), Progress()
-    due = [run for run in runs if run.state in ("missing", "cut")]
-    with _alone(root) if due else contextlib.nullcontext():
+    left = due(runs)
+    with _alone(root) if left else contextlib.nullcontext():
         for run in runs:
-            if run.state == "corrupt":
+            if isinstance(run, DamagedRun):
                 progress.failed[run.name] = _aside(root / run.name, run.problem)
-        _carry_out(due, root, progress, workers, train, say)
+        _carry_out(left, root, progress, workers, train, say)
     return progress
 
 
@@ -124,7 +145,7 @@ def _alone(root: Path) -> Iterator[None]:
 
 
 def _carry_out(
-    due: list[PlannedRun],
+    left: list[PlannedRun],
     root: Path,
     progress: Progress,
     workers: int | None,
@@ -132,13 +153,13 @@ def _carry_out(
     say: Callable[[str], None],
 ) -> None:
     checked: set[str] = set()
-    for number, run in enumerate(due, start=1):
+    for number, run in enumerate(left, start=1):
         _check_needs(run, root, progress, checked)
         if broken := [name for name in run.needs if _lost(name, progress)]:
             progress.skipped[run.name] = f"it needs {', '.join(broken)}"
             continue
         verb = f"goes on at {run.progress:.0%}" if run.state == "cut" else "begins"
-        say(f"run {number} of {len(due)}, {run.name}: {_described(run)}; it {verb}")
+        say(f"run {number} of {len(left)}, {run.name}: {_described(run)}; it {verb}")
         try:
             outcome = train(run, root, workers)
         except FolderInUseError as error:
@@ -175,10 +196,11 @@ def _check_needs(run: PlannedRun, root: Path, progress: Progress, checked: set[s
     and not what would have been made from it."""
     for name in run.needs:
         checkpoints = Checkpointer(root / name / "checkpoints")
-        if name in checked or _lost(name, progress) or checkpoints.latest() is None:
+        latest = checkpoints.latest()
+        if name in checked or _lost(name, progress) or latest is None:
             continue
         try:
-            load_tree(checkpoints.path(checkpoints.latest()), subtree="agent/params")
+            load_tree(checkpoints.path(latest), subtree="agent/params")
         except CorruptCheckpointError as error:
             progress.failed[name] = _aside(root / name, str(error))
         checked.add(name)
