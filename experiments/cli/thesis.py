@@ -20,6 +20,7 @@ from experiments.cli.options import (
     Base,
     Compared,
     ConfigFile,
+    Devices,
     Preset,
     Simulators,
     sequence,
@@ -53,6 +54,9 @@ class Sweep:
     fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread members over, each member on one of them. How many is no part of what a run
+    is: it goes on with more or fewer."""
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     yes: bool = False
     """At a terminal: begin without a question, however long it takes."""
@@ -173,9 +177,11 @@ def figures(command: Figures) -> int:
 
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
     """The runs behind tables and figures."""
+    from dreamer_jax.devices import check_devices
     from experiments.thesis.graph import plan_runs
 
     with usage_errors():
+        check_devices(sweep.devices)
         if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
             raise ValueError(f"seeds {sweep.seeds} must be one or more, each named once")
         for name, wanted, there in (
@@ -209,6 +215,7 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep) -> "tuple[Graph,
         train,
         accept_failed=sweep.accept_failed,
         timeout=sweep.simulators.simulator_timeout,
+        devices=sweep.devices,
     )
     with usage_errors():
         progress = carry_out_runs(runs, sweep.root, workers=sweep.simulators.workers, train=trains)
@@ -247,7 +254,7 @@ def plan(command: Plan) -> int:
     timeout = sweep.simulators.simulator_timeout
     known = _speed(left, timeout, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
-    print(estimate.plan_table(runs, known and known.speed))
+    print(estimate.plan_table(runs, known and known.speed, sweep.devices))
     if known is not None:
         ticks = 1000 * max(known.speed.tick_seconds.values())
         when = f"kept in {known.path} (--measure measures anew)" if known.kept else "here and now"
@@ -281,7 +288,7 @@ def _speed(left: "Sequence[PlannedRun]", timeout: float, again: bool = False) ->
     return speed_of(specs, cache_folder(), again=again, timeout=timeout, report=report)
 
 
-def _may_begin(runs: "Graph", timeout: float) -> bool:
+def _may_begin(runs: "Graph", timeout: float, devices: Devices) -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
@@ -296,7 +303,7 @@ def _may_begin(runs: "Graph", timeout: float) -> bool:
     if updates < LONG_SECONDS:
         return True
     speed = _speed(left, timeout).speed
-    total = estimate.together(runs, speed)
+    total = estimate.together(runs, speed, devices)
     if total.seconds < LONG_SECONDS:
         return True
     agents = sum(len(run.cells) for run in left)
@@ -319,7 +326,7 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
 
     if not sweep.yes and sys.stdin.isatty():
         timeout = sweep.simulators.simulator_timeout
-        if not _may_begin(_planned(entries, sweep), timeout):
+        if not _may_begin(_planned(entries, sweep), timeout, sweep.devices):
             print("nothing was begun")
             return STOPPED
     runs, progress = _carry_out(entries, sweep)

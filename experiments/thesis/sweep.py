@@ -14,6 +14,7 @@ import jax
 
 import envs
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
+from dreamer_jax.devices import Choice
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.locks import FolderInUseError, FolderLock
 from dreamer_jax.record_checks import RecordsError
@@ -57,6 +58,7 @@ def train(
     *,
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
@@ -66,6 +68,7 @@ def train(
       workers: simulator processes; by default one per core.
       accept_failed: transfer from agents that failed, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many to spread its members over.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
@@ -77,7 +80,7 @@ def train(
         # Of a run that was stopped before anything was kept, perhaps one of other cells.
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec)
+        spec = in_memory(spec, devices)
     try:
         begins = make_run(
             spec,
@@ -87,6 +90,7 @@ def train(
             base=root,
             accept_failed=accept_failed,
             timeout=timeout,
+            devices=devices,
             lock=lock,
             cells=run.cells,
         )
