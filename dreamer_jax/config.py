@@ -50,7 +50,8 @@ class NetworkConfig:
     minimum_std: float = setting(0.1, 0, 10, above=True)
     """Smallest standard deviation of the latent Gaussians."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of activations; parameters, sums and distributions are always float32."""
+    """Precision of activations; parameters, sums, what heads give and distributions are always
+    float32 (but for images, whose mean is rounded)."""
 
     def __post_init__(self):
         _require(

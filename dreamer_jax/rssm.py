@@ -111,7 +111,7 @@ class JoinedDense(nn.Module):
 
 
 class Prior(nn.Module):
-    """From the deterministic part to a Gaussian's two parameters."""
+    """From the deterministic part to a Gaussian's two parameters, float32."""
 
     hidden_size: int
     outputs: int
@@ -119,14 +119,14 @@ class Prior(nn.Module):
 
     def setup(self):
         self.hidden = Dense(self.hidden_size, dtype=self.dtype)
-        self.out = Dense(self.outputs, dtype=self.dtype)
+        self.out = Dense(self.outputs, dtype=self.dtype, output_dtype=jnp.float32)
 
     def __call__(self, deterministic: jax.Array) -> jax.Array:
         return self.out(elu(self.hidden(deterministic)))
 
 
 class Posterior(nn.Module):
-    """From the deterministic part and the embedding to a Gaussian's two parameters."""
+    """From the deterministic part and the embedding to a Gaussian's two parameters, float32."""
 
     sizes: tuple[int, int]
     hidden_size: int
@@ -135,7 +135,7 @@ class Posterior(nn.Module):
 
     def setup(self):
         self.hidden = JoinedDense(self.sizes, self.hidden_size, dtype=self.dtype)
-        self.out = Dense(self.outputs, dtype=self.dtype)
+        self.out = Dense(self.outputs, dtype=self.dtype, output_dtype=jnp.float32)
 
     def project(self, embedding: jax.Array) -> jax.Array:
         return self.hidden.project(embedding)
@@ -177,7 +177,7 @@ class Dynamics(nn.Module):
         self.posterior = Posterior(sizes, size, outputs, dtype=self.dtype)
 
     def _latent_state(self, statistics, noise, deterministic) -> LatentState:
-        mean, std = jnp.split(statistics.astype(jnp.float32), 2, axis=-1)
+        mean, std = jnp.split(statistics, 2, axis=-1)
         std = jax.nn.softplus(std) + self.minimum_std
         return LatentState(mean, std, mean + std * noise, deterministic)
 

@@ -5,7 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from dreamer_jax import networks
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.rollout import collect
@@ -68,6 +70,46 @@ def test_parameters_states_distributions_and_losses_stay_float32():
         return observed, heads, agent.decode(params, features)
 
     assert dtypes(jax.eval_shape(outputs, state.params, batch)) == {"float32"}
+
+
+@pytest.mark.parametrize("offset_by", ["bias", "product"])
+def test_a_bfloat16_head_tells_values_about_150_apart(offset_by):
+    """True values of 150 ± 0.5: rounded to bfloat16 they would be 150, or one beside it."""
+    head = networks.Head(1, layers=1, units=400, dtype=jnp.bfloat16)
+    inputs = jnp.linspace(-1, 1, 4096)[:, None]
+    params = networks.Head(1, layers=1, units=400).init(jax.random.key(0), inputs)["params"]
+    # Hidden units are about 1 each and move with the input, their sum does not.
+    params["hidden_0"]["kernel"] -= params["hidden_0"]["kernel"].mean()
+    params["hidden_0"]["bias"] += 1.0
+    hidden = networks.elu(inputs @ params["hidden_0"]["kernel"] + params["hidden_0"]["bias"])
+    mean, (slope,) = 150.0, params["hidden_0"]["kernel"]
+    weights = 0.5 * slope / (slope @ slope)
+    weights += mean / 400 if offset_by == "product" else 0.0
+    params["out"]["kernel"] = weights[:, None]
+    params["out"]["bias"] += mean - (hidden @ weights).mean()
+    truth = head.clone(dtype=jnp.float32).apply({"params": params}, inputs)[:, 0]
+    assert 149.4 < truth.min() < 149.6 and 150.4 < truth.max() < 150.6
+    values = head.apply({"params": params}, inputs)[:, 0]
+    assert values.dtype == jnp.float32
+    # Weights that are rounded move all values by as much, which is not what is looked at here.
+    difference = values - truth
+    assert (difference - difference.mean()).std() < 0.05
+    assert len(np.unique(values)) > 200
+
+
+def test_bfloat16_distributions_of_latent_states_are_float32_from_their_last_product_on():
+    dynamics = agent_of("bfloat16").dynamics
+    inputs = jnp.zeros((1, dynamics.embedding_size)), jnp.zeros((1, A))
+    shapes = jax.eval_shape(dynamics.init, jax.random.key(0), *inputs)
+    deterministic = jnp.zeros((1, dynamics.deterministic_size))
+
+    def statistics(params, deterministic):
+        return networks.applied(dynamics, params, deterministic, method="prior_statistics")
+
+    traced = jax.make_jaxpr(statistics)(shapes["params"], deterministic)
+    *_, last = [x for x in equations(traced.jaxpr) if x.primitive.name == "dot_general"]
+    assert [x.aval.dtype for x in last.invars] == [jnp.bfloat16] * 2
+    assert last.outvars[0].aval.dtype == jnp.float32
 
 
 def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
