@@ -14,7 +14,7 @@ import optax
 from dreamer_jax import learning, networks, randomness, rssm
 from dreamer_jax.freezing import Params
 from dreamer_jax.learning import AgentState, Metrics
-from dreamer_jax.model import Model
+from dreamer_jax.model import Model, multiplies
 from dreamer_jax.records import Records
 
 Mode = Literal["random", "explore", "evaluate"]
@@ -59,6 +59,7 @@ class Agent(Model):
         """
         return learning.start(self, params, seed)
 
+    @multiplies
     def update(self, state: AgentState, batch: Records) -> tuple[AgentState, Metrics]:
         """One update of all that is trained: see `dreamer_jax.learning.update`."""
         return learning.update(self, state, batch)
@@ -72,6 +73,7 @@ class Agent(Model):
         nothing = jnp.zeros(self.action_size)
         return Carry(self.dynamics.initial(), nothing, nothing)
 
+    @multiplies
     def policy(
         self,
         params: Params,

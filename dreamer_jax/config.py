@@ -52,6 +52,9 @@ class NetworkConfig:
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of activations; parameters, sums, what heads give and distributions are always
     float32 (but for images, whose mean is rounded)."""
+    matmul_precision: Literal["default", "float32"] = "default"
+    """Precision in which float32 matrices are multiplied. default: JAX's for the device (on NVIDIA
+    cards TensorFloat-32, with 10 bits after the point, on TPUs bfloat16; on CPUs float32)."""
 
     def __post_init__(self):
         _require(

@@ -100,15 +100,16 @@ def _episode(agent: Model, params: Params, records: Records, key: jax.Array):
     furthest = max(OPEN_LOOP)
     ahead = times[None, :] + jnp.arange(1, furthest + 1)[:, None]
     reachable = jnp.minimum(ahead, len(times) - 1)
-    imagined = rssm.imagine(
-        agent.dynamics,
-        params["dynamics"],
-        lambda features, action: action,
-        posterior,
-        furthest,
-        imagine_key,
-        records.action[reachable],
-    )
+    with agent.matmul_precision():
+        imagined = rssm.imagine(
+            agent.dynamics,
+            params["dynamics"],
+            lambda features, action: action,
+            posterior,
+            furthest,
+            imagine_key,
+            records.action[reachable],
+        )
     for steps in OPEN_LOOP:
         features = imagined.features[steps - 1]
         errors = agent.reward(params, features) - records.reward[reachable[steps - 1]]

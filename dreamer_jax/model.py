@@ -10,9 +10,11 @@ Parameters are one dict whose names read like the thesis:
     termination/{hidden_i, out}, where the option is on
 """
 
+import contextlib
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,19 @@ from dreamer_jax.config import Config
 from dreamer_jax.convolutions import normalise_image
 from dreamer_jax.freezing import Params
 from dreamer_jax.records import Records
+
+Method = TypeVar("Method", bound=Callable)
+
+
+def multiplies(method: Method) -> Method:
+    """A method of a model, with products of matrices in the precision that its settings ask for."""
+
+    @functools.wraps(method)
+    def within(self, *arguments, **named):
+        with self.matmul_precision():
+            return method(self, *arguments, **named)
+
+    return within  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -44,6 +59,14 @@ class Model:
     @functools.cached_property
     def dtype(self):
         return jnp.dtype(self.config.network.precision)
+
+    def matmul_precision(self) -> contextlib.AbstractContextManager:
+        """Within it, products that are traced have the precision that the settings ask for."""
+        precision = self.config.network.matmul_precision
+        if precision == "default":
+            # What JAX's own setting says, JAX_DEFAULT_MATMUL_PRECISION.
+            return contextlib.nullcontext()
+        return jax.default_matmul_precision(precision)
 
     @functools.cached_property
     def encoder(self) -> networks.Encoder:
@@ -107,6 +130,7 @@ class Model:
             for name, (module, inputs) in modules.items()
         }
 
+    @multiplies
     def head(self, params: Params, name: str, features: jax.Array) -> jax.Array:
         """The outputs of one head: float [..., M] -> float32 [..., outputs]."""
         return networks.applied(self.heads[name], params[name], features)
@@ -119,14 +143,17 @@ class Model:
         """Predicted value of a latent state: [..., M] -> float32 [...]."""
         return self.head(params, "value", features)[..., 0]
 
+    @multiplies
     def encode(self, params: Params, image: jax.Array) -> jax.Array:
         """Embeddings: uint8 [..., size, size, 3] -> [..., E]."""
         return networks.applied(self.encoder, params["encoder"], normalise_image(image))
 
+    @multiplies
     def decode(self, params: Params, features: jax.Array) -> jax.Array:
         """Reconstructed images, float32 about [-0.5, 0.5]: [..., M] -> [..., size, size, 3]."""
         return networks.applied(self.decoder, params["decoder"], features)
 
+    @multiplies
     def observe(
         self, params: Params, batch: Records, key: jax.Array
     ) -> tuple[rssm.LatentState, jax.Array, jax.Array]:
@@ -154,6 +181,7 @@ class Model:
             return networks.one_hot_sample(outputs, noise)
         return networks.tanh_normal_sample(outputs, noise)
 
+    @multiplies
     def predict(
         self, params: Params, batch: Records, context: int, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:

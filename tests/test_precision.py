@@ -10,6 +10,7 @@ import pytest
 from dreamer_jax import networks
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
+from dreamer_jax.diagnosis import diagnose
 from dreamer_jax.rollout import collect
 from probes import Probe
 
@@ -110,6 +111,36 @@ def test_bfloat16_distributions_of_latent_states_are_float32_from_their_last_pro
     *_, last = [x for x in equations(traced.jaxpr) if x.primitive.name == "dot_general"]
     assert [x.aval.dtype for x in last.invars] == [jnp.bfloat16] * 2
     assert last.outvars[0].aval.dtype == jnp.float32
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"), [("default", None), ("float32", (jax.lax.Precision.HIGHEST,) * 2)]
+)
+def test_products_of_an_update_a_policy_and_a_diagnosis_have_the_precision_asked_for(
+    setting, expected
+):
+    network = dataclasses.replace(CONFIG.network, matmul_precision=setting)
+    agent = Agent(dataclasses.replace(CONFIG, network=network), A)
+    state = jax.eval_shape(agent.init, 0)
+    batch = jax.eval_shape(lambda: jax.tree.map(lambda x: x[0], stored_batches(agent)))
+    first, size = jnp.bool_(True), agent.config.network.image_size
+    image, key = jnp.zeros((size, size, 3), jnp.uint8), jax.random.key(0)
+
+    def act(params):
+        return agent.policy(params, agent.initial_carry(), image, first, key, "explore")
+
+    def diagnosed(params, batch):
+        one = jax.tree.map(lambda x: x[None], (params, batch, jnp.int32(0)))
+        return diagnose(agent, *one, jnp.int32(0))
+
+    for traced in (
+        jax.make_jaxpr(agent.update)(state, batch),
+        jax.make_jaxpr(act)(state.params),
+        jax.make_jaxpr(diagnosed)(state.params, batch),
+    ):
+        products = [x for x in equations(traced.jaxpr) if x.primitive.name == "dot_general"]
+        assert products
+        assert {x.params["precision"] for x in products} == {expected}
 
 
 def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_jax import config as configs
-from experiments.cli.main import COMMANDS, main
+from experiments.cli.main import COMMANDS, DETERMINISTIC, main, repeat_on_cards
 from experiments.cli.options import read_base
 from experiments.methods.fractional import FractionalTransfer
 from experiments.runs.spec import RunSpec
@@ -33,6 +33,41 @@ def cpu_seconds(*arguments, folder=ROOT, code=0):
     assert done.returncode == code, done.stdout + done.stderr
     after = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     return after - before, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("plugin", "platforms", "flags", "expected"),
+    [
+        (True, None, None, "--xla_gpu_deterministic_ops=true"),
+        (True, "cuda,cpu", "--xla_a=1", "--xla_a=1 --xla_gpu_deterministic_ops=true"),
+        (True, None, "--xla_gpu_deterministic_ops=false", "--xla_gpu_deterministic_ops=false"),
+        (True, "cpu", None, None),
+        (False, None, None, None),
+    ],
+)
+def test_nvidia_cards_are_told_to_give_the_same_numbers_each_time(
+    tmp_path, monkeypatch, plugin, platforms, flags, expected
+):
+    if plugin:
+        (tmp_path / "jax_cuda13_plugin").mkdir()
+        (tmp_path / "jax_cuda13_plugin" / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, value in (("JAX_PLATFORMS", platforms), ("XLA_FLAGS", flags)):
+        monkeypatch.delenv(name, raising=False)
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    repeat_on_cards()
+    assert os.environ.get("XLA_FLAGS") == expected
+
+
+def test_this_xla_knows_the_flag_for_the_same_numbers():
+    # An unknown one ends the process.
+    subprocess.run(
+        [sys.executable, "-c", "import jax; jax.numpy.zeros(1).block_until_ready()"],
+        env=os.environ | {"XLA_FLAGS": f"{DETERMINISTIC}=true", "JAX_PLATFORMS": "cpu"},
+        check=True,
+        timeout=60,
+    )
 
 
 HEAVY = ("jax", "flax", "PIL", "yaml", "matplotlib", "envs.pool", "dreamer_jax.training")

@@ -4,6 +4,7 @@ What takes long to import is imported by the command that needs it, so that bad 
 answered at once.
 """
 
+import importlib.util
 import inspect
 import os
 import sys
@@ -73,6 +74,7 @@ def main(arguments: Sequence[str] | None = None, program: str = PROGRAM) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _keep_compiled_functions()
+    repeat_on_cards()
     with safe_output():
         return _main(arguments, program)
 
@@ -125,6 +127,25 @@ def _keep_compiled_functions() -> None:
     except RuntimeError:  # neither HOME nor an entry in the list of users
         return
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache / "dreamer-transfer" / "jax"))
+
+
+DETERMINISTIC = "--xla_gpu_deterministic_ops"
+"""The flag of XLA's with which a program gives the same numbers each time that it runs on a GPU."""
+
+
+def repeat_on_cards() -> None:
+    """Has NVIDIA cards give the same numbers each time, so that resumed runs are the same.
+
+    XLA reads this when it makes its first program. Whoever sets the flag, to false too, has it so.
+    Nothing is set where JAX has no plugin for such a card, or is told not to use it.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    elsewhere = platforms and not {"cuda", "gpu"} & set(platforms.split(","))
+    plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+    if DETERMINISTIC in flags or elsewhere or not any(map(importlib.util.find_spec, plugins)):
+        return
+    os.environ["XLA_FLAGS"] = f"{flags} {DETERMINISTIC}=true".strip()
 
 
 def _parse(arguments: list[str], program: str) -> tuple[Command, Any]:
