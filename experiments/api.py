@@ -42,6 +42,7 @@ from envs.pixel_env import PixelEnv
 from experiments import methods
 from experiments.runs import evaluate as evaluation
 from experiments.runs.agents import load_source, make_agent
+from experiments.runs.memory import in_memory
 from experiments.runs.run import carry_out, make_run
 from experiments.runs.spec import RunSpec
 
@@ -279,6 +280,8 @@ def _with(config: Config, settings: Mapping[str, Any]) -> Config:
 def _run(spec: RunSpec, out: str | Path | None, workers: int | None, devices: Choice) -> Trained:
     """Carries out a run, or what is left of it."""
     directory = RUNS / _name(spec) if out is None else Path(out)
+    if spec.config.schedule.mapping == "auto":
+        spec = in_memory(spec, devices)
     run = make_run(spec, directory, resume=True, workers=workers, devices=devices)
     if carry_out(run) == "stopped":
         raise KeyboardInterrupt(f"stopped and saved in {directory}: the same call goes on")

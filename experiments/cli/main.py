@@ -112,9 +112,10 @@ def _is_told(error: Exception) -> bool:
     from dreamer_jax.record_checks import RecordsError
     from dreamer_jax.training import NonFiniteError
     from envs import SimulatorError
+    from experiments.runs.memory import OutOfMemoryError
 
     known = (SimulatorError, NonFiniteError, CorruptCheckpointError, DamagedError, RecordsError)
-    return isinstance(error, known)
+    return isinstance(error, (*known, OutOfMemoryError))
 
 
 def _keep_compiled_functions() -> None:

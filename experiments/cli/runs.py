@@ -213,10 +213,13 @@ def train(command: Train) -> int:
         if is_of_another(run.out):
             check_trust([run.out], run.trust)
     from dreamer_jax.host_memory import keep_freed_memory
+    from experiments.runs.memory import in_memory
     from experiments.runs.run import carry_out, make_run
 
     keep_freed_memory()
     with usage_errors():
+        if spec.config.schedule.mapping == "auto":
+            spec = in_memory(spec, run.devices)
         begun = make_run(
             spec,
             run.out,

@@ -25,6 +25,7 @@ from dreamer_jax.integrity import DamagedError, write_sealed_json
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.training import Run
 from experiments.runs.agents import make_agent, make_env
+from experiments.runs.memory import is_exhausted, out_of_memory
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.runs.start import load_sources, transferred_members
 
@@ -184,9 +185,18 @@ def _plain(value):
 
 
 def carry_out(run: Run) -> Literal["finished", "stopped"]:
-    """Trains to the end or to Ctrl-C, and closes the run and its simulators."""
+    """Trains to the end or to Ctrl-C, and closes the run and its simulators.
+
+    Raises:
+      OutOfMemoryError: a device has no memory left; names what may fit.
+      Exception: others, see `dreamer_jax.training.Run.train`.
+    """
     try:
         return run.train()
+    except (jax.errors.JaxRuntimeError, MemoryError) as error:
+        if not is_exhausted(error):
+            raise
+        raise out_of_memory(run) from error
     finally:
         run.close()
         run.env.close()

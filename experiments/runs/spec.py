@@ -19,6 +19,9 @@ from experiments.methods.scratch import Scratch
 if TYPE_CHECKING:
     from dreamer_jax.training import Member
 
+OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
+"""How members are mapped depends on the machine and changes no result but by rounding."""
+
 
 @dataclass(frozen=True)
 class RunSpec:
@@ -97,12 +100,17 @@ class RunSpec:
         )
 
     def differences(self, other: "RunSpec") -> tuple[Difference, ...]:
-        """What differs between two; settings of methods go by their names."""
+        """What differs between two, but for `OF_THE_MACHINE`; settings of methods go by their
+        names."""
         one, two = self._flat(), other._flat()
         pairs = [Difference(name, one.get(name), two.get(name)) for name in {**one, **two}]
         return (
             *(pair for pair in pairs if pair.one != pair.other),
-            *configs.differences(self.config, other.config),
+            *(
+                pair
+                for pair in configs.differences(self.config, other.config)
+                if pair.path not in OF_THE_MACHINE
+            ),
         )
 
     def _flat(self) -> dict[str, Any]:

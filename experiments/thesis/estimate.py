@@ -7,27 +7,20 @@ work beside one another, each for its own members; several devices of one proces
 Axis letters: P population member, K task.
 """
 
-import dataclasses
-import functools
 import itertools
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
-import envs
-from dreamer_jax.agent import Agent
-from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.devices import Choice, place
 from dreamer_jax.schedule import Schedule
 from experiments.runs.agents import make_agent
-from experiments.runs.spec import RunSpec, action_size
+from experiments.runs.memory import at_once, bytes_of, member_bytes, record_bytes
 from experiments.runs.text import aligned
 from experiments.thesis.graph import Graph, PlannedRun, due
-from experiments.thesis.measurement import Speed, compiled_update
+from experiments.thesis.measurement import Speed
 
-MEMORY_SHARE, CHECKPOINTS = 0.8, 2
+CHECKPOINTS = 2
 SLACK = 1.5
 """How much longer a run may take than what is counted of it."""
 NAME_COLUMNS = 30
@@ -48,46 +41,10 @@ class Estimate:
     disk: int
 
 
-def _bytes(tree) -> int:
-    return sum(
-        int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in jax.tree.leaves(tree)
-    )
-
-
-@functools.cache
-def _member_bytes(agent: Agent) -> int:
-    """Parameters and both moments of Adam of one member."""
-    return _bytes(jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32)))
-
-
-def _record_bytes(spec: RunSpec) -> int:
-    """Image, action, reward and two flags."""
-    size = spec.config.network.image_size
-    return 3 * size * size + 4 * action_size(spec.tasks) + 4 + 2
-
-
-def _memory(spec: RunSpec, update_bytes: int, members: int, chunk: int) -> int:
-    """Bytes of some members: states, two batches, one phase of records twice, and the updates of
-    one chunk."""
-    learning, schedule = spec.config.learning, spec.config.schedule
-    records = learning.batch_size * learning.sequence_length
-    records += (schedule.phase_ticks + 1) * len(spec.tasks)
-    each = _member_bytes(make_agent(spec)) + 2 * records * _record_bytes(spec)
-    return members * each + chunk * update_bytes
-
-
-def _chunk(spec: RunSpec, members: int) -> int:
-    """How many of the members of one device an update maps at once."""
-    schedule = spec.config.schedule
-    one_by_one = schedule.mapping == "auto" and jax.default_backend() == "cpu"
-    if schedule.mapping == "chunks" or one_by_one:
-        return min(schedule.mapping_chunk, members)
-    return members
-
-
 def estimate(run: PlannedRun, speed: Speed, devices: Choice = "all") -> Estimate:
     """What a run that is missing or was cut still takes, its members spread over devices."""
     spec, each = run.spec, place(len(run.spec.members), devices).each
+    agent = make_agent(spec)
     members, tasks, schedule = len(spec.members), len(spec.tasks), spec.config.schedule
     whole = Schedule(schedule, tasks)
     ticks = (whole.rounds + whole.evaluations) * schedule.phase_ticks
@@ -101,35 +58,11 @@ def estimate(run: PlannedRun, speed: Speed, devices: Choice = "all") -> Estimate
     records = whole.rounds * (schedule.phase_ticks + 1)
     if schedule.replay_keep is not None:
         records = min(records, schedule.replay_keep)
-    disk = slots * records * _record_bytes(spec)
-    disk += CHECKPOINTS * members * _member_bytes(make_agent(spec))
-    memory = _memory(spec, speed.update_bytes, each, _chunk(spec, each))
+    disk = slots * records * record_bytes(agent)
+    disk += CHECKPOINTS * members * member_bytes(agent)
+    memory = bytes_of(agent, tasks, each, at_once(agent, each), speed.update_bytes)
     seconds += speed.compile_seconds + sum(speed.tick_compile_seconds[task] for task in spec.tasks)
     return Estimate(seconds, memory, disk)
-
-
-def in_memory(spec: RunSpec, devices: Choice = "all") -> RunSpec:
-    """The spec with its updates in chunks, where a device's memory is short for all of its members
-    at once (and for their replay, if that lies there too)."""
-    device = jax.local_devices()[0]
-    limit = (device.memory_stats() or {}).get("bytes_limit")
-    each = place(len(spec.members), devices).each
-    if limit is None or _chunk(spec, each) == 1:
-        return spec
-    alone = dataclasses.replace(spec, seeds=spec.seeds[:1])
-    update = compiled_update(make_agent(alone))
-    update_bytes = max(1, update.memory_analysis().temp_size_in_bytes)
-    taken = _memory(spec, update_bytes, each, 0)
-    sizes = len(spec.tasks), each
-    if on_device(make_agent(spec), any(x.has_host for x in envs.specs(spec.tasks)), *sizes)[0]:
-        taken += replay_bytes(make_agent(spec), *sizes)
-    fits = int(MEMORY_SHARE * limit - taken) // update_bytes
-    if fits >= _chunk(spec, each):
-        return spec
-    schedule = dataclasses.replace(
-        spec.config.schedule, mapping="chunks", mapping_chunk=max(1, fits)
-    )
-    return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
 
 
 def together(runs: Graph, speed: Speed, devices: Choice = "all") -> Estimate:

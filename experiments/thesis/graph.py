@@ -11,7 +11,7 @@ from dreamer_jax.config import Config, Difference
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.schedule import Counters, Schedule
 from experiments.runs.folder import CELLS, begun, failed_members, read_cells, run_folders
-from experiments.runs.spec import RunSpec, read_spec
+from experiments.runs.spec import OF_THE_MACHINE, RunSpec, read_spec
 from experiments.thesis.grid import Cell
 from experiments.thesis.populations import (
     MULTITASK_STEPS,
@@ -20,9 +20,6 @@ from experiments.thesis.populations import (
     new_populations,
     of_length,
 )
-
-# How members are mapped depends on the machine and changes no result but by rounding.
-_OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def changed_settings(root: str | Path) -> tuple[Difference, ...]:
 def _of_results(one: Config, other: Config) -> tuple[Difference, ...]:
     """Differences of what results depend on."""
     pairs = configs.differences(one, other)
-    return tuple(pair for pair in pairs if pair.path not in _OF_THE_MACHINE)
+    return tuple(pair for pair in pairs if pair.path not in OF_THE_MACHINE)
 
 
 def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> Graph:

@@ -4,7 +4,6 @@ Axis letters: T ticks.
 """
 
 import dataclasses
-import functools
 import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -18,9 +17,9 @@ import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
 from dreamer_jax.progress import Report, unreported
-from dreamer_jax.records import Records
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
+from experiments.runs.memory import traced_update
 from experiments.runs.spec import RunSpec
 from experiments.thesis import flops
 
@@ -64,31 +63,9 @@ class Speed:
     scaled: float = 1.0
 
 
-@functools.cache
-def _traced_update(agent: Agent):
-    """One member's update, traced for its shapes."""
-    learning, size = agent.config.learning, agent.config.network.image_size
-    shape = (learning.batch_size, learning.sequence_length)
-    batch = Records(
-        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
-        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
-        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
-        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
-        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
-    )
-    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
-    return jax.jit(agent.update).trace(state, batch), state, batch
-
-
-@functools.cache
-def compiled_update(agent: Agent):
-    """One member's update, compiled."""
-    return _traced_update(agent)[0].lower().compile()
-
-
 def _made_up(agent: Agent):
     """A state and a batch of made-up numbers for one member's update."""
-    _, state, batch = _traced_update(agent)
+    _, state, batch = traced_update(agent)
     random = np.random.default_rng(0)
 
     def make(leaf):
@@ -129,7 +106,7 @@ def sample_of(agent: Agent) -> tuple[Agent, float]:
 
 def _operations(agent: Agent) -> float:
     """Of one member's update."""
-    return flops.of_jaxpr(_traced_update(agent)[0].jaxpr.jaxpr)
+    return flops.of_jaxpr(traced_update(agent)[0].jaxpr.jaxpr)
 
 
 def _scaled_bytes(agent: Agent, part: Agent, temporary: int) -> int:
@@ -164,7 +141,7 @@ def measure(
     widest = max(tasks, key=lambda task: envs.spec(task).action_size)
     agent = make_agent(RunSpec((widest,), (0,), specs[0].config))
     part, times = sample_of(agent)
-    lowered = _traced_update(part)[0].lower()
+    lowered = traced_update(part)[0].lower()
 
     def compiled():
         started = time.perf_counter()

@@ -21,8 +21,8 @@ from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
 from experiments.runs.folder import CELLS, begun, set_aside
+from experiments.runs.memory import OutOfMemoryError, in_memory
 from experiments.runs.run import carry_out, make_run
-from experiments.thesis.estimate import in_memory
 from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due
 
 
@@ -169,7 +169,13 @@ def _carry_out(
             progress.failed[run.name] = (
                 _aside(root / run.name, str(error)) if damaged else str(error)
             )
-        except (SimulatorError, NonFiniteError, RecordsError, jax.errors.JaxRuntimeError) as error:
+        except (
+            SimulatorError,
+            NonFiniteError,
+            RecordsError,
+            OutOfMemoryError,
+            jax.errors.JaxRuntimeError,
+        ) as error:
             progress.failed[run.name] = f"{error} (it is kept as it is; the same command goes on)"
         else:
             if outcome == "stopped":

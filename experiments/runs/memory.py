@@ -1,0 +1,156 @@
+"""The memory of a device: what an update takes of it, and how many members it has room for at once.
+
+Axis letters: P population member, K task.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from dreamer_jax.agent import Agent
+from dreamer_jax.device_round import on_device, replay_bytes
+from dreamer_jax.devices import Choice, place
+from dreamer_jax.records import Records
+from dreamer_jax.training import Run
+from experiments.runs.agents import make_agent
+from experiments.runs.spec import RunSpec
+
+MEMORY_SHARE = 0.8
+"""Share of a device's memory that is counted on."""
+
+
+class OutOfMemoryError(RuntimeError):
+    """A device has no room for what a run asks of it; names the way out."""
+
+
+@functools.cache
+def traced_update(agent: Agent):
+    """One member's update, traced for its shapes, and the shapes of its state and its batch."""
+    learning, size = agent.config.learning, agent.config.network.image_size
+    shape = (learning.batch_size, learning.sequence_length)
+    batch = Records(
+        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
+        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
+        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
+        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
+        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
+    )
+    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
+    return jax.jit(agent.update).trace(state, batch), state, batch
+
+
+@functools.cache
+def compiled_update(agent: Agent):
+    """One member's update, compiled."""
+    return traced_update(agent)[0].lower().compile()
+
+
+@functools.cache
+def member_bytes(agent: Agent) -> int:
+    """Parameters and both moments of Adam of one member."""
+    state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
+    return sum(
+        int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in jax.tree.leaves(state)
+    )
+
+
+def record_bytes(agent: Agent) -> int:
+    """Image, action, reward and two flags."""
+    size = agent.config.network.image_size
+    return 3 * size * size + 4 * agent.action_size + 4 + 2
+
+
+def bytes_of(agent: Agent, tasks: int, members: int, at_once: int, update_bytes: int) -> int:
+    """Bytes of some members: states, two batches, one phase of records twice, and their updates.
+
+    Args:
+      agent: theirs.
+      tasks: K.
+      members: how many lie on the device.
+      at_once: how many of them an update maps at once.
+      update_bytes: what one member's update takes beside its state and batch.
+    """
+    learning, schedule = agent.config.learning, agent.config.schedule
+    records = learning.batch_size * learning.sequence_length
+    records += (schedule.phase_ticks + 1) * tasks
+    each = member_bytes(agent) + 2 * records * record_bytes(agent)
+    return members * each + at_once * update_bytes
+
+
+def at_once(agent: Agent, members: int) -> int:
+    """How many of the members of one device an update maps at once."""
+    schedule = agent.config.schedule
+    one_by_one = schedule.mapping == "auto" and jax.default_backend() == "cpu"
+    if schedule.mapping == "chunks" or one_by_one:
+        return min(schedule.mapping_chunk, members)
+    return members
+
+
+def room_for(agent: Agent, tasks: int, members: int, has_host: bool) -> int | None:
+    """How many members' updates a device has memory for at once, by what the compiler says of one.
+
+    Args:
+      agent: theirs.
+      tasks: K.
+      members: how many lie on the device, their replay too if it is kept there.
+      has_host: whether the environment has simulators on the host.
+
+    Returns:
+      At least 1; None where the device does not tell its memory.
+    """
+    limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
+    if limit is None:
+        return None
+    update_bytes = max(1, compiled_update(agent).memory_analysis().temp_size_in_bytes)
+    taken = bytes_of(agent, tasks, members, 0, update_bytes)
+    if on_device(agent, has_host, tasks, members)[0]:
+        taken += replay_bytes(agent, tasks, members)
+    return max(1, int(MEMORY_SHARE * limit - taken) // update_bytes)
+
+
+def in_memory(spec: RunSpec, devices: Choice = "all") -> RunSpec:
+    """The spec with its updates in chunks, where a device's memory is short for all of its members
+    at once (and for their replay, if that lies there too)."""
+    agent, each = make_agent(spec), place(len(spec.members), devices).each
+    if at_once(agent, each) == 1:
+        return spec
+    has_host = any(task.has_host for task in envs.specs(spec.tasks))
+    fits = room_for(agent, len(spec.tasks), each, has_host)
+    if fits is None or fits >= at_once(agent, each):
+        return spec
+    schedule = dataclasses.replace(spec.config.schedule, mapping="chunks", mapping_chunk=fits)
+    return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
+
+
+def is_exhausted(error: BaseException | None) -> bool:
+    """Whether an error, or what caused it, is that a device has no memory left."""
+    if error is None:
+        return False
+    ours = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    return ours or is_exhausted(error.__cause__)
+
+
+def out_of_memory(run: Run) -> OutOfMemoryError:
+    """What to say of a run whose device had no memory left: what it mapped, and what may fit."""
+    agent, each, tasks = run.agent, run.placement.each, len(run.tasks)
+    mapped = at_once(agent, each)
+    told = (
+        f"a device has no memory left: an update mapped {mapped} "
+        f"member{'s' if mapped > 1 else ''} at once, of {each} on each device"
+    )
+    others = "fewer agents to a run, smaller batches (--batch-size), or --replay files if it is not"
+    if mapped == 1:
+        return OutOfMemoryError(f"{told}: what is left is {others}")
+    room, half = room_for(agent, tasks, each, run.env.has_host), mapped // 2
+    if room is not None and room < mapped:
+        chunk, why = room, "by the compiler's count that fits"
+    else:
+        chunk, why = half, "half as many; fewer if that does not fit either"
+    return OutOfMemoryError(
+        f"{told}. Go on with --resume --mapping chunks --mapping-chunk {chunk} ({why}). Else: "
+        f"{others}"
+    )
