@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import importlib.util
 import io
 import re
 from pathlib import Path
@@ -103,3 +104,16 @@ def test_sections_of_docstrings_are_indented_by_two_spaces(package):
     ]
     assert [place for place in found if place[2] != 2] == []
     assert len(found) > 20
+
+
+def test_what_an_update_takes_on_paper_is_what_the_program_for_it_prints():
+    spec = importlib.util.spec_from_file_location("arithmetic", DOCS / "arithmetic.py")
+    arithmetic = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(arithmetic)
+    page = (DOCS / "scaling.md").read_text(encoding="utf-8")
+    lines = list(arithmetic.of_one_member())
+    assert len(lines) > 5 and "\n".join(lines) in page
+    assert f"**{arithmetic.SHARE:.0%}".replace("%", " %") in page
+    # The tables of one agent; those of many take longer to count.
+    (entry,) = [table for name, table in arithmetic.TABLES.items() if name == "table-13"]
+    assert f"| 13 to 15 {arithmetic.row(arithmetic.shown(entry))}\n" in page
