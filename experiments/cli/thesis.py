@@ -1,10 +1,11 @@
-"""Commands on the thesis's grid: table, figure, plan. Their options, and what they do.
+"""Commands on the thesis's grid: table, figure, sweep, plan. Their options, and what they do.
 
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
+import contextlib
 import dataclasses
-import functools
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,14 @@ import tyro
 
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
-from experiments.cli.exits import FAILURE, STOPPED, usage_errors
+from experiments.cli.engines import (
+    Execution,
+    check_execution,
+    chosen_run,
+    engine_options,
+    tell_problems,
+)
+from experiments.cli.exits import STOPPED, usage_errors
 from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, Table
@@ -68,6 +76,7 @@ class Tables:
     names: tyro.conf.Positional[tuple[str, ...]]
     """Numbers of tables (1 to 17), or all."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+    execution: tyro.conf.OmitArgPrefixes[Execution] = Execution()
 
 
 @dataclass(frozen=True)
@@ -77,6 +86,22 @@ class Figures:
     names: tyro.conf.Positional[tuple[str, ...]]
     """Numbers of figures (10 to 39), or all."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+    execution: tyro.conf.OmitArgPrefixes[Execution] = Execution()
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """Train what tables and figures of the thesis need, and make no reports of it.
+
+    As `table` and `figure` do it: what is done is not repeated, and what was cut goes on.
+    """
+
+    table: tuple[str, ...] = ()
+    """Numbers of tables (1 to 17), or all."""
+    figure: tuple[str, ...] = ()
+    """Numbers of figures (10 to 39), or all."""
+    sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+    execution: tyro.conf.OmitArgPrefixes[Execution] = Execution()
 
 
 @dataclass(frozen=True)
@@ -94,6 +119,8 @@ class Plan:
     """Numbers of figures (10 to 39), or all."""
     measure: bool = False
     """Measure this machine anew."""
+    json: bool = False
+    """Print the graph as JSON, with estimates where this machine was measured before."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
 
 
@@ -114,6 +141,11 @@ def table_defaults(base: Base) -> Tables:
 def figure_defaults(base: Base) -> Figures:
     """Defaults of `figure`."""
     return Figures(names=tyro.MISSING, sweep=_sweep(base))
+
+
+def sweep_defaults(base: Base) -> Sweeps:
+    """Defaults of `sweep`."""
+    return Sweeps(sweep=_sweep(base))
 
 
 def plan_defaults(base: Base) -> Plan:
@@ -150,14 +182,38 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    return _make([_beside(entry, command.sweep) for entry in entries], command.sweep)
+    beside = [_beside(entry, command.sweep) for entry in entries]
+    return _make(beside, command.sweep, command.execution)
 
 
 def figures(command: Figures) -> int:
     """Makes figures."""
     with usage_errors():
         entries = chosen(grid.FIGURES, command.names, command.sweep.backend)
-    return _make(entries, command.sweep)
+    return _make(entries, command.sweep, command.execution)
+
+
+def sweep(command: Sweeps) -> int:
+    """Trains what tables and figures need."""
+    entries = _entries(command.table, command.figure, command.sweep, "train")
+    if not _begins(entries, command.sweep, command.execution):
+        return STOPPED
+    _, progress = _carry_out(entries, command.sweep, command.execution)
+    return tell_problems(progress)
+
+
+def _entries(
+    table: Sequence[str], figure: Sequence[str], sweep: Sweep, verb: str
+) -> list[Table | Figure]:
+    """The tables and figures of the given numbers."""
+    with usage_errors():
+        if not (table or figure):
+            raise ValueError(f"nothing to {verb}: add --table 3, or --figure 12, or all of them")
+        entries = [
+            *(chosen(grid.TABLES, table, sweep.backend) if table else ()),
+            *(chosen(grid.FIGURES, figure, sweep.backend) if figure else ()),
+        ]
+    return [_beside(entry, sweep) for entry in entries]
 
 
 def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
@@ -174,10 +230,12 @@ def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
     return entry
 
 
-def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
-    """The runs behind tables and figures."""
-    from experiments.thesis.graph import plan_runs
+def _cells(entries: Sequence[Table | Figure], sweep: Sweep) -> list[grid.Cell]:
+    """The cells that tables and figures show.
 
+    Raises:
+      UsageError: what is asked for is not there.
+    """
     with usage_errors():
         if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
             raise ValueError(f"seeds {sweep.seeds} must be one or more, each named once")
@@ -190,43 +248,48 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         if not set(sweep.compared) <= set(grid.COMPARED):
             raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
         entries = [_restricted(entry, sweep) for entry in entries]
-        cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
-        return plan_runs(cells, sweep.config, sweep.root)
+        return [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
 
 
-def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep):
+def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
+    """The runs behind tables and figures, beside what others are at; nothing is reserved."""
+    from experiments.thesis.graph import plan_runs
+    from experiments.thesis.reservations import standing
+
+    cells = _cells(entries, sweep)
+    with usage_errors():
+        return plan_runs(cells, sweep.config, sweep.root, standing(sweep.root))
+
+
+def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution):
     """Trains what is missing of tables and figures.
 
     Returns:
       The runs behind them, and what became of these.
 
     Raises:
-      UsageError: results of other settings are there, or a simulator is not installed.
+      UsageError: results of other settings are there, or a simulator or an engine is not installed.
     """
     from dreamer_jax.host_memory import keep_freed_memory
-    from experiments.thesis.sweep import carry_out_runs, train
+    from experiments.thesis.estimate import DUE
+    from experiments.thesis.reservations import planned
+    from experiments.thesis.sweep import carry_out_runs
 
-    runs = _planned(entries, sweep)
-    if any(run.state in ("missing", "cut") for run in runs):
-        keep_freed_memory()
-    trains = functools.partial(train, accept_failed=sweep.accept_failed)
-    with usage_errors():
-        progress = carry_out_runs(runs, sweep.root, workers=sweep.workers, train=trains)
-    if progress.stopped:
+    cells = _cells(entries, sweep)
+    with contextlib.ExitStack() as at_work:
+        with usage_errors():
+            check_execution(execution)
+            runs = at_work.enter_context(planned(cells, sweep.config, sweep.root))
+            wanted = chosen_run(runs, execution.run)
+            if execution.executor == "local" and any(run.state in DUE for run in wanted):
+                keep_freed_memory()
+            options = engine_options(execution, wanted, sweep.workers)
+            progress = carry_out_runs(
+                wanted, sweep.root, accept_failed=sweep.accept_failed, **options
+            )
+    if progress.stopped and not progress.left:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
     return runs, progress
-
-
-def _tell_problems(progress) -> int:
-    """Names what was not trained.
-
-    Returns:
-      The exit code.
-    """
-    for kind, names in (("failed", progress.failed), ("skipped", progress.skipped)):
-        for name, reason in names.items():
-            print(f"{kind}: {name}: {reason}", file=sys.stderr)
-    return 0 if progress.complete else FAILURE
 
 
 def plan(command: Plan) -> int:
@@ -234,14 +297,13 @@ def plan(command: Plan) -> int:
     from experiments.thesis import estimate
 
     sweep = command.sweep
-    with usage_errors():
-        if not (command.table or command.figure):
-            raise ValueError("nothing to plan: add --table 3, or --figure 12, or all of them")
-        entries = [
-            *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
-            *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
-        ]
-    runs = _planned([_beside(entry, sweep) for entry in entries], sweep)
+    entries = _entries(command.table, command.figure, sweep, "plan")
+    runs = _planned(entries, sweep)
+    if command.json:
+        if command.measure:
+            _speed(runs, again=True)
+        print(json.dumps(_as_json(runs, sweep), indent=1))
+        return 0
     known = _speed(runs, again=command.measure)
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed))
@@ -259,6 +321,30 @@ def plan(command: Plan) -> int:
                 f"{known.speed.scaled:.3g}: its time may be off by {estimate.SCALING_ERROR:.0%}."
             )
     return 0
+
+
+def _as_json(runs, sweep: Sweep) -> dict[str, object]:
+    """The graph as JSON holds it: what it is, and of each run what an engine asks."""
+    from experiments.thesis.engines.demands import estimates
+    from experiments.thesis.speeds import cache_folder
+
+    known = estimates(runs, cache_folder())
+    found = []
+    for run in runs:
+        one = known.get(run.name)
+        estimated = {} if one is None else dataclasses.asdict(one)
+        found.append(
+            {
+                "name": run.name,
+                "needs": run.needs,
+                "state": run.state,
+                "progress": run.progress,
+                "tasks": run.spec.tasks if run.spec else (),
+                "cells": run.cells,
+                **{key: estimated.get(key) for key in ("seconds", "memory", "disk")},
+            }
+        )
+    return {"root": str(sweep.root), "preset": sweep.preset, "runs": found}
 
 
 LONG_SECONDS = 3600.0
@@ -311,18 +397,32 @@ def _may_begin(runs) -> bool:
         return False
 
 
-def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
+def _begins(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution) -> bool:
+    """Whether to begin: what takes long here is asked about at a terminal."""
+    with usage_errors():
+        check_execution(execution)
+    if execution.executor != "local" or sweep.yes or not sys.stdin.isatty():
+        return True
+    runs = _planned(entries, sweep)
+    with usage_errors():
+        wanted = chosen_run(runs, execution.run)
+    if _may_begin(wanted):
+        return True
+    print("nothing was begun")
+    return False
+
+
+def _make(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution) -> int:
     """Trains what is missing and writes tables and figures."""
     from dreamer_jax.progress import reported
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
-    if not sweep.yes and sys.stdin.isatty() and not _may_begin(_planned(entries, sweep)):
-        print("nothing was begun")
+    if not _begins(entries, sweep, execution):
         return STOPPED
-    runs, progress = _carry_out(entries, sweep)
-    if progress.stopped:
-        return STOPPED
+    runs, progress = _carry_out(entries, sweep, execution)
+    if progress.stopped or execution.run is not None:
+        return tell_problems(progress)
     run_of = {cell: run.name for run in runs for cell in run.cells}
     for entry in entries:
         if entry.kind != "ltc":
@@ -344,4 +444,4 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
         except ValueError as error:
             progress.failed[entry.name] = str(error)
     write_reports(entries, sweep.root, sweep.backend, sweep.seeds)
-    return _tell_problems(progress)
+    return tell_problems(progress)

@@ -1,8 +1,9 @@
 """The graph of runs behind cells of the grid: what is done, what is missing, and in which order."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 from dreamer_jax import config as configs
@@ -23,6 +24,16 @@ from experiments.thesis.populations import (
 
 # How members are mapped depends on the machine and changes no result but by rounding.
 _OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
+
+# What reading a damaged folder raises; a checkpoint that its run replaces meanwhile is not found.
+_UNREADABLE = (
+    FileNotFoundError,
+    ValueError,
+    KeyError,
+    TypeError,
+    IndexError,
+    CorruptCheckpointError,
+)
 
 
 @dataclass(frozen=True)
@@ -78,7 +89,12 @@ def _of_results(one: Config, other: Config) -> tuple[Difference, ...]:
     return tuple(pair for pair in pairs if pair.path not in _OF_THE_MACHINE)
 
 
-def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[PlannedRun, ...]:
+def plan_runs(
+    cells: Iterable[Cell],
+    config: Config,
+    root: str | Path,
+    reserved: Mapping[str, PlannedRun] = MappingProxyType({}),
+) -> tuple[PlannedRun, ...]:
     """The runs behind cells, each after those that it needs, and those that were cut first.
 
     Cells that are done, or whose run has begun, need no source any more: nothing is repeated, and
@@ -88,6 +104,7 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[
       cells: what is asked for.
       config: settings of all runs, those of a preset.
       root: the folder of all results of these settings.
+      reserved: runs that others plan there, by name; those that have begun are as they are found.
 
     Raises:
       ValueError: a run was made with other settings; names them on both sides.
@@ -96,6 +113,22 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[
     held, found = _places(root)
     used: dict[str, PlannedRun] = {run.name: run for run in found.values() if not run.cells}
     missing: dict[Cell, None] = {}
+    begun_names = {name for name, _ in held.values()} | set(found)
+    for run in reserved.values():
+        if run.name not in begun_names:
+            found[run.name] = run
+            for member, cell_name in enumerate(run.cells):
+                held.setdefault(cell_name, (run.name, member))
+
+    def use(name: str) -> PlannedRun:
+        if name not in found:
+            found[name] = inspect_run(root / name)
+        if name not in used:
+            used[name] = found[name]
+            for needed in found[name].needs:  # of those that others plan perhaps for other cells
+                if needed in reserved or begun(root / needed):
+                    use(needed)
+        return found[name]
 
     def visit(cell: Cell) -> None:
         if cell in missing:
@@ -106,17 +139,16 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> tuple[
             missing.setdefault(cell)
             return
         name, _ = held[cell.name]
-        if name not in found:
-            found[name] = _inspect(root / name)
-        used[name] = found[name]
-        _check_settings(root / name, found[name], config_of(cell, config))
-        if found[name].needs:
+        run = use(name)
+        _check_settings(root / name, run, config_of(cell, config))
+        if run.needs:
             for needed in cell.needs:
                 visit(needed)
 
     for cell in cells:
         visit(cell)
-    populations = new_populations(tuple(missing), config, held, _taken_names(root))
+    taken = _taken_names(root) | set(reserved)
+    populations = new_populations(tuple(missing), config, held, taken)
     new = [_planned(population) for population in populations]
     there = sorted(used.values(), key=lambda run: run.state != "cut")
     return _in_order([*there, *new])
@@ -173,10 +205,11 @@ def _corrupt(folder: Path, cells: tuple[str, ...], error: Exception) -> PlannedR
     return PlannedRun(folder.name, cells, None, state="corrupt", problem=str(error))
 
 
-def _inspect(folder: Path) -> PlannedRun:
-    """A run as its folder tells."""
-    cells = read_cells(folder)
+def inspect_run(folder: Path) -> PlannedRun:
+    """A run that has begun, as its folder tells."""
+    cells: tuple[str, ...] = ()
     try:
+        cells = read_cells(folder)
         spec = read_spec(folder)
         if len(spec.members) != len(cells):
             raise ValueError(f"{folder} has {len(spec.members)} agents and names {len(cells)}")
@@ -198,7 +231,7 @@ def _inspect(folder: Path) -> PlannedRun:
                 failed=failed,
             )
         counters = Counters(**checkpoints.metadata(checkpoints.latest())["counters"])
-    except (ValueError, KeyError, TypeError, IndexError, CorruptCheckpointError) as error:
+    except _UNREADABLE as error:
         return _corrupt(folder, cells, error)
     done = schedule.next(counters) == "done"
     progress = counters.updates / max(1, schedule.updates)

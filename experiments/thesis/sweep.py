@@ -1,27 +1,17 @@
-"""Runs planned runs one after another: what was cut goes on, what fails is named, the rest goes on.
+"""Carries out planned runs on an engine: what was cut goes on, what fails is named, the rest goes
+on. Those that need what failed are left for the next time."""
 
-A run whose folder is damaged is set aside: renamed, never deleted. Those that need it are left for
-the next time.
-"""
-
-import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
-import jax
-
-from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
-from dreamer_jax.files import write_json_atomically
-from dreamer_jax.locks import FolderInUseError, FolderLock
-from dreamer_jax.record_checks import RecordsError
-from dreamer_jax.training import NonFiniteError
-from envs import SimulatorError
-from experiments.runs.folder import CELLS, begun, set_aside
-from experiments.runs.run import carry_out, make_run
-from experiments.thesis.estimate import in_memory
-from experiments.thesis.graph import PlannedRun
+from experiments.runs.folder import run_folders
+from experiments.thesis.engines import Engine, Resources, Task
+from experiments.thesis.engines.local import in_turn, one_by_one
+from experiments.thesis.estimate import DUE
+from experiments.thesis.graph import PlannedRun, inspect_run
+from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, Train, set_aside_damaged
+from experiments.thesis.reservations import at_work, reservations
 
 
 @dataclass
@@ -30,150 +20,118 @@ class Progress:
 
     Attributes:
       finished: names of the runs that were trained to their end.
+      shared: those that another process has finished meanwhile.
       failed: those that were not, and why.
       skipped: those that need one of these, and which.
       stopped: whether Ctrl-C ended it.
+      left: whether what is not done is with a queue that goes on by itself.
     """
 
     finished: list[str] = field(default_factory=list)
+    shared: list[str] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     stopped: bool = False
+    left: bool = False
 
     @property
     def complete(self) -> bool:
         """Whether nothing failed and nothing is left."""
         return not (self.failed or self.skipped or self.stopped)
 
-
-Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
-
-
-def train(
-    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
-) -> Literal["finished", "stopped"]:
-    """Begins a run or goes on with it, until it is done or stopped.
-
-    Raises:
-      ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
-      SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
-    """
-    folder, spec = root / run.name, run.spec
-    lock = FolderLock(folder)
-    if not begun(folder):
-        # Of a run that was stopped before anything was kept, perhaps one of other cells.
-        (folder / "run.json").unlink(missing_ok=True)
-        write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec)
-    try:
-        options = {"workers": workers, "base": root, "lock": lock, "cells": run.cells}
-        options["accept_failed"] = accept_failed
-        return carry_out(make_run(spec, folder, resume=True, **options))
-    finally:
-        # The programs of its simulators serve no other run, and take up to 100 MiB a task.
-        jax.clear_caches()
+    def add(self, ending: Ending) -> None:
+        """Notes what became of a run."""
+        self.failed |= ending.damaged
+        match ending.kind:
+            case "finished":
+                self.finished.append(ending.name)
+            case "there":
+                self.shared.append(ending.name)
+            case "failed":
+                self.failed[ending.name] = ending.message
+            case "skipped":
+                self.skipped[ending.name] = ending.message
+            case "stopped" | "left":
+                self.stopped = True
+                self.left |= ending.kind == "left"
 
 
 def carry_out_runs(
     runs: Sequence[PlannedRun],
     root: str | Path,
     *,
+    engine: Engine = one_by_one,
     workers: int | None = None,
-    train: Train = train,
-    say: Callable[[str], None] = print,
+    accept_failed: bool = False,
+    resources: Callable[[PlannedRun], Resources] = lambda run: Resources(),
+    say: Say = print,
 ) -> Progress:
-    """Trains what is missing and goes on with what was cut, in the order given.
+    """Trains what is missing and goes on with what was cut, each run after those it needs.
 
     Args:
-      runs: from `graph.plan_runs`.
+      runs: from `reservations.planned`, whose context lasts.
       root: the folder of all results.
+      engine: where they are trained; by default here, in the order given.
       workers: simulator processes; by default one per core.
-      train: what trains one run.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+      resources: what a run gets.
       say: where messages go.
-
-    Raises:
-      ValueError: another process trains runs under the same root.
     """
-    root, progress = Path(root), Progress()
-    due = [run for run in runs if run.state in ("missing", "cut")]
-    with _alone(root) if due else contextlib.nullcontext():
-        for run in runs:
-            if run.state == "corrupt":
-                progress.failed[run.name] = _aside(root / run.name, run.problem)
-        _carry_out(due, root, progress, workers, train, say)
+    root, progress = Path(root).absolute(), Progress()
+
+    def job(run: PlannedRun) -> Job:
+        return Job(root, run.name, workers, accept_failed)
+
+    for run in runs:
+        if run.state == "corrupt" and (ending := set_aside_damaged(job(run))):
+            progress.add(ending)
+    due = [run for run in runs if run.state in DUE]
+    names = {run.name for run in due}
+    tasks = [
+        Task(
+            job(run),
+            run,
+            tuple(name for name in run.needs if name in names),
+            resources(run),
+            f"run {number} of {len(due)}, {run.name}",
+        )
+        for number, run in enumerate(due, start=1)
+    ]
+    for ending in engine(tasks, say):
+        progress.add(ending)
     return progress
 
 
-@contextlib.contextmanager
-def _alone(root: Path) -> Iterator[None]:
-    """Keeps other processes from training runs under a root, until this one is done or dead."""
-    try:
-        lock = FolderLock(root)
-    except FolderInUseError as error:
-        raise ValueError(
-            f"another command is training in {root} ({error.holder}): wait until it is done, or "
-            "name another folder with --results"
-        ) from None
-    with lock:
-        yield
+def work(
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    accept_failed: bool = False,
+    train: Train | None = None,
+    say: Say = print,
+    poll: float = POLL_SECONDS,
+) -> Progress:
+    """Trains what is planned under a root by whomever, and what was cut there, beside others who
+    do the same, until nothing is left.
 
+    Args:
+      root: the folder of all results.
+      workers: simulator processes; by default one per core.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+      train: what trains one run.
+      say: where messages go.
+      poll: seconds between looks at what others do.
+    """
+    root, progress = Path(root).absolute(), Progress()
 
-def _carry_out(
-    due: list[PlannedRun],
-    root: Path,
-    progress: Progress,
-    workers: int | None,
-    train: Train,
-    say: Callable[[str], None],
-) -> None:
-    checked: set[str] = set()
-    for number, run in enumerate(due, start=1):
-        _check_needs(run, root, progress, checked)
-        if broken := [name for name in run.needs if _lost(name, progress)]:
-            progress.skipped[run.name] = f"it needs {', '.join(broken)}"
-            continue
-        verb = f"goes on at {run.progress:.0%}" if run.state == "cut" else "begins"
-        say(f"run {number} of {len(due)}, {run.name}: {_described(run)}; it {verb}")
-        try:
-            outcome = train(run, root, workers)
-        except FolderInUseError as error:
-            progress.failed[run.name] = str(error)
-        except (ValueError, CorruptCheckpointError) as error:
-            damaged = begun(root / run.name)
-            progress.failed[run.name] = (
-                _aside(root / run.name, str(error)) if damaged else str(error)
-            )
-        except (SimulatorError, NonFiniteError, RecordsError, jax.errors.JaxRuntimeError) as error:
-            progress.failed[run.name] = f"{error} (it is kept as it is; the same command goes on)"
-        else:
-            if outcome == "stopped":
-                progress.stopped = True
-                return
-            progress.finished.append(run.name)
+    def due() -> Iterator[Task]:
+        planned = reservations(root)
+        runs = {folder.name: inspect_run(folder) for folder in run_folders(root)}
+        for run in {**planned, **runs}.values():
+            if run.state in DUE:
+                yield Task(Job(root, run.name, workers, accept_failed), run, run.needs)
 
-
-def _described(run: PlannedRun) -> str:
-    agents = f"{len(run.cells)} agents" if len(run.cells) > 1 else "1 agent"
-    return f"{agents} on {' + '.join(run.spec.tasks)}"
-
-
-def _lost(name: str, progress: Progress) -> bool:
-    return name in progress.failed or name in progress.skipped
-
-
-def _aside(folder: Path, problem: str) -> str:
-    return f"{problem}; it was set aside as {set_aside(folder).name}, and trains anew next time"
-
-
-def _check_needs(run: PlannedRun, root: Path, progress: Progress, checked: set[str]) -> None:
-    """Reads the newest checkpoint of what a run needs, so that a damaged one is set aside itself
-    and not what would have been made from it."""
-    for name in run.needs:
-        checkpoints = Checkpointer(root / name / "checkpoints")
-        if name in checked or _lost(name, progress) or checkpoints.latest() is None:
-            continue
-        try:
-            load_tree(checkpoints.path(checkpoints.latest()), subtree="agent/params")
-        except CorruptCheckpointError as error:
-            progress.failed[name] = _aside(root / name, str(error))
-        checked.add(name)
+    with at_work(root):
+        for ending in in_turn(lambda: list(due()), say, train=train, poll=poll):
+            progress.add(ending)
+    return progress

@@ -1,0 +1,218 @@
+"""One run of the graph, trained by whoever claims it: this process, another, another machine.
+
+A job names a run and no more: what the run is stands in its folder, or in the plan of what has not
+begun. So a job can be done again, later or elsewhere, and goes on with what is there.
+
+What fails is named. A folder that is damaged is set aside: renamed, never deleted.
+"""
+
+import contextlib
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import jax
+
+from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
+from dreamer_jax.files import write_json_atomically
+from dreamer_jax.locks import FolderInUseError, FolderLock
+from dreamer_jax.record_checks import RecordsError
+from dreamer_jax.training import NonFiniteError
+from envs import SimulatorError
+from experiments.runs.folder import CELLS, begun, set_aside
+from experiments.runs.run import carry_out, make_run
+from experiments.thesis.estimate import in_memory
+from experiments.thesis.graph import PlannedRun, inspect_run
+from experiments.thesis.reservations import at_work, claim, forget, reserved
+
+POLL_SECONDS = 5.0
+"""How often whoever waits for others looks whether they are done."""
+
+Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run to train, told so that any process on any machine that sees its folder can.
+
+    Attributes:
+      root: the folder of all results.
+      name: of the run.
+      workers: simulator processes; by default one per core.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+    """
+
+    root: Path
+    name: str
+    workers: int | None = None
+    accept_failed: bool = False
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What became of a job.
+
+    Attributes:
+      name: of the run.
+      kind: "finished"; "there" (somebody else had finished it); "stopped" (and saved, it can go
+        on); "busy" (another process trains it); "failed"; "skipped" (what it needs is not there);
+        or "left" (it is with a queue that goes on by itself).
+      message: why, or who, in words.
+      damaged: other runs that were set aside, and why.
+    """
+
+    name: str
+    kind: Literal["finished", "there", "stopped", "busy", "failed", "skipped", "left"]
+    message: str = ""
+    damaged: dict[str, str] = field(default_factory=dict)
+
+
+def train(
+    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
+) -> Literal["finished", "stopped"]:
+    """Begins a run or goes on with it, until it is done or stopped.
+
+    Raises:
+      ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
+      SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
+    """
+    assert run.spec is not None  # only what is damaged has none
+    folder, spec = root / run.name, run.spec
+    lock = FolderLock(folder)
+    if not begun(folder):
+        # Of a run that was stopped before anything was kept, perhaps one of other cells.
+        (folder / "run.json").unlink(missing_ok=True)
+        write_json_atomically(folder / CELLS, list(run.cells))
+        spec = in_memory(spec)
+    try:
+        return carry_out(
+            make_run(
+                spec,
+                folder,
+                resume=True,
+                workers=workers,
+                base=root,
+                accept_failed=accept_failed,
+                lock=lock,
+                cells=run.cells,
+            )
+        )
+    finally:
+        # The programs of its simulators serve no other run, and take up to 100 MiB a task.
+        jax.clear_caches()
+
+
+def perform(
+    job: Job,
+    *,
+    train: Train | None = None,
+    begins: Callable[[PlannedRun], None] = lambda run: None,
+    wait: bool = False,
+    say: Say = print,
+) -> Ending:
+    """Claims a run and trains it, if it is not done and all that it needs is.
+
+    Args:
+      job: the run.
+      train: what trains it; by default `train`.
+      begins: called with the run as it is found, before it is trained.
+      wait: for another process that trains it, instead of ending as "busy".
+      say: where messages of waiting go.
+    """
+    told = ""
+    while True:
+        with at_work(job.root):
+            try:
+                with claim(job.root, job.name):
+                    return _perform(job, train, begins)
+            except FolderInUseError as error:
+                holder = error.holder
+        if not wait:
+            return Ending(job.name, "busy", holder)
+        if holder != told:
+            say(f"{job.name} is trained by {holder}: waiting for it")
+        told = holder
+        time.sleep(POLL_SECONDS)
+
+
+def set_aside_damaged(job: Job) -> Ending | None:
+    """Sets aside the folder of a run that was found to be damaged, if it is and nobody trains it.
+
+    Returns:
+      How the run failed; none if it did not.
+    """
+    root = Path(job.root)
+    with contextlib.suppress(FolderInUseError), at_work(root), claim(root, job.name):
+        if (root / job.name).exists() and (run := inspect_run(root / job.name)).state == "corrupt":
+            return Ending(job.name, "failed", _aside(root, job.name, run.problem))
+    return None
+
+
+def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]) -> Ending:
+    """The run is claimed.
+
+    Raises:
+      FolderInUseError: another process works in its folder, without a claim.
+    """
+    root, name = Path(job.root), job.name
+    run = inspect_run(root / name) if begun(root / name) else reserved(root, name)
+    if run is None:
+        told = "it is planned no more: the same command plans it anew"
+        return Ending(name, "failed", told)
+    if run.state == "corrupt":
+        return Ending(name, "failed", _aside(root, name, run.problem))
+    if run.state == "done":
+        return Ending(name, "there")
+    damaged = _damaged_needs(run, root)
+    if lacking := [needed for needed in run.needs if not _is_done(root / needed)]:
+        return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
+    begins(run)
+    if train is None:
+        train = functools.partial(_train, accept_failed=job.accept_failed)
+    try:
+        kind = train(run, root, job.workers)
+    except FolderInUseError:
+        raise
+    except (ValueError, CorruptCheckpointError) as error:
+        kept = begun(root / name)
+        return Ending(name, "failed", _aside(root, name, str(error)) if kept else str(error))
+    except (SimulatorError, NonFiniteError, RecordsError, jax.errors.JaxRuntimeError) as error:
+        return Ending(name, "failed", f"{error} (it is kept as it is; the same command goes on)")
+    if kind == "finished":
+        forget(root, name)
+    return Ending(name, kind)
+
+
+_train = train  # which a parameter of that name hides
+
+
+def _aside(root: Path, name: str, problem: str) -> str:
+    """Sets a run's folder aside, and takes back its plan: it is planned anew another time."""
+    with FolderLock(root / name):
+        forget(root, name)
+        kept = set_aside(root / name).name
+    return f"{problem}; it was set aside as {kept}, and trains anew next time"
+
+
+def _is_done(folder: Path) -> bool:
+    return begun(folder) and inspect_run(folder).state == "done"
+
+
+def _damaged_needs(run: PlannedRun, root: Path) -> dict[str, str]:
+    """Reads the newest checkpoint of what a run needs, so that a damaged one is set aside itself
+    and not what would have been made from it."""
+    found = {}
+    for name in run.needs:
+        checkpoints = Checkpointer(root / name / "checkpoints")
+        if (newest := checkpoints.latest()) is None:
+            continue
+        try:
+            load_tree(checkpoints.path(newest), subtree="agent/params")
+        except CorruptCheckpointError as error:
+            with contextlib.suppress(FolderInUseError), claim(root, name):
+                found[name] = _aside(root, name, str(error))
+    return found
