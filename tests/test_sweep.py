@@ -21,7 +21,7 @@ from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, closure, shown
 from experiments.thesis.reservations import planned
 from experiments.thesis.sweep import carry_out_runs
-from runs import CONFIG, finish
+from runs import CONFIG, Trainer, finish
 
 TWO_TARGETS = (
     dataclasses.replace(TABLES["table-3"], counts=(2,), omegas=(0.1, 0.2)),
@@ -38,24 +38,6 @@ def cells_of(*entries, seeds=(0, 1)):
 
 def plan(root, *entries, seeds=(0, 1)):
     return plan_runs(cells_of(*entries, seeds=seeds), CONFIG, root)
-
-
-class Trainer:
-    """Finishes runs in a moment and notes their names; those named in `failing` raise."""
-
-    def __init__(self, failing=None, stop_at=None):
-        self.failing, self.stop_at, self.trained = failing or {}, stop_at, []
-
-    def __call__(self, run, root, workers):
-        self.trained.append(run.name)
-        if run.name == self.stop_at:
-            finish(run, root, share=0.5)
-            return "stopped"
-        if run.name in self.failing:
-            finish(run, root, share=0.5)
-            raise self.failing[run.name]
-        finish(run, root)
-        return "finished"
 
 
 def sweep(root, *entries, **behaviour):

@@ -74,7 +74,8 @@ def check_execution(execution: Execution) -> None:
             owners = [engine for engine, names in own.items() if name in names]
             if execution.executor not in owners:
                 raise ValueError(f"--{name} is for --executor {' or '.join(owners)}")
-    engine_of(execution)
+    if execution.executor != "local":
+        engine_of(execution)
 
 
 def engine_of(execution: Execution) -> "Engine":

@@ -9,7 +9,7 @@ What fails is named. A folder that is damaged is set aside: renamed, never delet
 import contextlib
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -127,16 +127,34 @@ def perform(
     while True:
         with at_work(job.root):
             try:
-                with claim(job.root, job.name):
+                with _claimed(job.root, job.name):
                     return _perform(job, train, begins)
-            except FolderInUseError as error:
-                holder = error.holder
+            except _BusyError as error:
+                busy = str(error)
         if not wait:
-            return Ending(job.name, "busy", holder)
-        if holder != told:
-            say(f"{job.name} is trained by {holder}: waiting for it")
-        told = holder
+            return Ending(job.name, "busy", busy)
+        if busy != told:
+            say(f"waiting: {busy}")
+        told = busy
         time.sleep(POLL_SECONDS)
+
+
+class _BusyError(Exception):
+    """Another process trains a run; says which."""
+
+
+@contextlib.contextmanager
+def _claimed(root: Path, name: str) -> Iterator[None]:
+    """The sole right to train a run.
+
+    Raises:
+      _BusyError: another process has it.
+    """
+    try:
+        with claim(root, name):
+            yield
+    except FolderInUseError as error:
+        raise _BusyError(f"{name} is trained by {error.holder}") from None
 
 
 def set_aside_damaged(job: Job) -> Ending | None:
@@ -157,6 +175,7 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
 
     Raises:
       FolderInUseError: another process works in its folder, without a claim.
+      _BusyError: another process trains what it needs.
     """
     root, name = Path(job.root), job.name
     run = inspect_run(root / name) if begun(root / name) else reserved(root, name)
@@ -168,7 +187,7 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
     if run.state == "done":
         return Ending(name, "there")
     damaged = _damaged_needs(run, root)
-    if lacking := [needed for needed in run.needs if not _is_done(root / needed)]:
+    if lacking := [needed for needed in run.needs if not _is_done(root, needed)]:
         return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
     begins(run)
     if train is None:
@@ -198,8 +217,21 @@ def _aside(root: Path, name: str, problem: str) -> str:
     return f"{problem}; it was set aside as {kept}, and trains anew next time"
 
 
-def _is_done(folder: Path) -> bool:
-    return begun(folder) and inspect_run(folder).state == "done"
+def _is_done(root: Path, name: str) -> bool:
+    """Whether what is needed is done.
+
+    Raises:
+      _BusyError: it is not, but another process is at it.
+    """
+
+    def done() -> bool:
+        return begun(root / name) and inspect_run(root / name).state == "done"
+
+    if done() and Checkpointer(root / name / "checkpoints").latest() is not None:
+        return True
+    # One without a checkpoint was copied without; or all of it is evaluated, and it is being saved.
+    with _claimed(root, name):
+        return done()
 
 
 def _damaged_needs(run: PlannedRun, root: Path) -> dict[str, str]:

@@ -38,7 +38,7 @@ def in_turn(
       due: what there is to do, asked again after each; what has ended here is not done again.
     """
     ended: set[str] = set()
-    told: dict[str, str] = {}
+    told: set[str] = set()
     while tasks := [task for task in due() if task.name not in ended]:
         names = {task.name for task in tasks}
         busy: dict[str, str] = {}
@@ -55,10 +55,9 @@ def in_turn(
                 return
             break
         else:
-            if busy != told:
-                who = "; ".join(f"{name} is trained by {holder}" for name, holder in busy.items())
-                say(f"waiting: {who}")
-            told = busy
+            if not told.issuperset(busy.values()):
+                say("waiting: " + "; ".join(dict.fromkeys(busy.values())))
+            told = set(busy.values())
             try:
                 time.sleep(poll)
             except KeyboardInterrupt:
