@@ -216,7 +216,7 @@ HERE = cells_of((0, 1))
     [
         # Of other targets: a source that both have is copied once, if at all.
         (cells_of((0, 1), WALKERS), ""),
-        # Of other seeds, so that runs have the same names: copied under others, which nothing reads.
+        # Of other seeds, in runs of the same names: copied under others, which nothing reads.
         (cells_of((0, 2)), "-there"),
     ],
 )

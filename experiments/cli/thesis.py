@@ -412,9 +412,7 @@ def _begins(entries: Sequence[Table | Figure], sweep: Sweep, execution: Executio
     return False
 
 
-def _make(
-    entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution = Execution()
-) -> int:
+def _make(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution) -> int:
     """Trains what is missing and writes tables and figures."""
     from dreamer_jax.progress import reported
     from experiments.cli.reports import write_reports

@@ -9,6 +9,7 @@ What fails is named. A folder that is damaged is set aside: renamed, never delet
 import contextlib
 import functools
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -137,6 +138,16 @@ def perform(
             say(f"waiting: {busy}")
         told = busy
         time.sleep(POLL_SECONDS)
+
+
+def perform_elsewhere(job: Job) -> Ending:
+    """Performs a job for an engine in a process of its own: waits for others who train its run,
+    and tells whatever happens, with the trace in the process's own log."""
+    try:
+        return perform(job, wait=True)
+    except Exception as error:
+        traceback.print_exc()
+        return Ending(job.name, "failed", f"{type(error).__name__}: {error}")
 
 
 class _BusyError(Exception):

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from experiments.thesis.engines import Resources, Task
-from experiments.thesis.jobs import Ending, Job, Say, perform
+from experiments.thesis.jobs import Ending, Job, Say, perform_elsewhere
 
 RETRIES = 10
 """How often a run whose process or machine was lost is begun again; each time it goes on."""
@@ -143,7 +143,7 @@ def _tell_if_too_large(task: Task, asked: dict[str, Any], say: Say) -> None:
 def _perform(job: Job, *needed: Ending) -> Ending:
     """What a Ray task does; what it needs has ended before, well or not, which the folder tells."""
     _share_of_a_card()
-    return perform(job, wait=True)
+    return perform_elsewhere(job)
 
 
 def _share_of_a_card() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.thesis.engines import Engine, Resources, Task
-from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, perform
+from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, perform_elsewhere
 from experiments.thesis.reservations import WORK
 
 HOURS = 4.0
@@ -31,7 +31,7 @@ class Perform:
         # Slurm says SIGTERM before it preempts or cancels. A run would save and be done with it;
         # it is the signal after it that requeues a job, and what is on the disk suffices to go on.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        return perform(job, wait=True)
+        return perform_elsewhere(job)
 
     def checkpoint(self, job: Job):
         """What submitit submits in the place of a job that is interrupted: the same again."""
@@ -171,6 +171,6 @@ def _ending(name: str, job: Any) -> Ending:
 
     try:
         return job.result()
-    except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError) as error:
-        told = str(error).strip().splitlines()
-        return Ending(name, "failed", f"job {job.job_id}: {told[-1] if told else 'it failed'}")
+    except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError):
+        told = f"job {job.job_id} ended without a word: see {job.paths.stderr}"
+        return Ending(name, "failed", f"{told} (it is kept as it is; the same command goes on)")
