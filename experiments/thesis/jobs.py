@@ -19,6 +19,7 @@ import jax
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 from dreamer_jax.files import write_json_atomically
+from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.locks import FolderInUseError, FolderLock
 from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
@@ -28,6 +29,7 @@ from experiments.runs.run import carry_out, make_run
 from experiments.thesis.estimate import in_memory
 from experiments.thesis.graph import PlannedRun, inspect_run
 from experiments.thesis.reservations import at_work, claim, forget, reserved
+from experiments.thesis.speeds import cache_folder
 
 POLL_SECONDS = 5.0
 """How often whoever waits for others looks whether they are done."""
@@ -143,6 +145,9 @@ def perform(
 def perform_elsewhere(job: Job) -> Ending:
     """Performs a job for an engine in a process of its own: waits for others who train its run,
     and tells whatever happens, with the trace in the process's own log."""
+    keep_freed_memory()
+    if jax.config.jax_compilation_cache_dir is None:  # as the command line says it
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder().with_name("jax")))
     try:
         return perform(job, wait=True)
     except Exception as error:

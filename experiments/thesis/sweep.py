@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from experiments.runs.folder import run_folders
+from experiments.runs.folder import folders
 from experiments.thesis.engines import Engine, Resources, Task
 from experiments.thesis.engines.local import in_turn, one_by_one
 from experiments.thesis.estimate import DUE
@@ -126,7 +126,9 @@ def work(
 
     def due() -> Iterator[Task]:
         planned = reservations(root)
-        runs = {folder.name: inspect_run(folder) for folder in run_folders(root)}
+        # Of copies that hold the same agents, that which plans take.
+        names = {folder for folder, _ in folders(root).values()}
+        runs = {folder.name: inspect_run(folder) for folder in sorted(names)}
         for run in {**planned, **runs}.values():
             if run.state in DUE:
                 yield Task(Job(root, run.name, workers, accept_failed), run, run.needs)
