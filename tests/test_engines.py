@@ -222,7 +222,6 @@ def test_jobs_in_this_process_train_what_they_are_given_in_order(tmp_path, monke
     # What a process of its own settles for itself.
     monkeypatch.setattr(on_slurm.signal, "signal", lambda *_: None)
     monkeypatch.setattr(jobs, "keep_freed_memory", lambda: None)
-    monkeypatch.setattr(jobs.jax.config, "update", lambda *_: None)
     with planned(CELLS, CONFIG, tmp_path) as runs:
         engine = slurm_engine(["cluster=debug"])
         progress = carry_out_runs(runs, tmp_path, engine=engine, say=lambda _: None)

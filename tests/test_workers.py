@@ -207,6 +207,15 @@ def test_a_worker_ends_when_all_that_is_left_needs_what_failed(tmp_path):
     assert progress.skipped == {TARGETS: f"it needs {SOURCES[0]}"}
 
 
+def test_a_worker_leaves_copies_of_agents_that_are_there_as_they_are(tmp_path):
+    with plan(tmp_path) as runs:
+        for run in runs:
+            finish(run, tmp_path)
+        finish(dataclasses.replace(runs[0], name="copy"), tmp_path, share=0.5)
+    trainer = Trainer()
+    assert work(tmp_path, train=trainer, say=lambda _: None).complete and trainer.trained == []
+
+
 WALKERS = dataclasses.replace(TABLES["table-5"], counts=(2, 3), omegas=(0.1,))
 HERE = cells_of((0, 1))
 

@@ -32,7 +32,7 @@ from experiments.thesis.reservations import WORK
 ROOT = Path(__file__).parents[2]
 PARTS = ("ray", "slurm", "workers")
 TABLES = ("7", "13")
-LENGTH = ("--environment-steps", "600", "--evaluate-every", "120", "--checkpoint-every", "120")
+LENGTH = ("--environment-steps", "320", "--evaluate-every", "80", "--checkpoint-every", "80")
 SHARED = ("--preset", "debug", "--seeds", "0", "1", "--counts", "2", "--omegas", "0.1", "0.2")
 COMMAND = ("table", *TABLES, *SHARED, *LENGTH, "--workers", "1")
 RESULTS = Path("results") / "debug"
