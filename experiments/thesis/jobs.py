@@ -10,7 +10,7 @@ import contextlib
 import functools
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -202,8 +202,9 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
         return Ending(name, "failed", _aside(root, name, run.problem))
     if run.state == "done":
         return Ending(name, "there")
-    damaged = _damaged_needs(run, root)
-    if lacking := [needed for needed in run.needs if not _is_done(root, needed)]:
+    done = [needed for needed in run.needs if _is_done(root, needed)]
+    damaged = _damaged(done, root)
+    if lacking := [needed for needed in run.needs if needed not in done or needed in damaged]:
         return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
     begins(run)
     if train is None:
@@ -250,11 +251,15 @@ def _is_done(root: Path, name: str) -> bool:
         return done()
 
 
-def _damaged_needs(run: PlannedRun, root: Path) -> dict[str, str]:
-    """Reads the newest checkpoint of what a run needs, so that a damaged one is set aside itself
-    and not what would have been made from it."""
+def _damaged(names: Iterable[str], root: Path) -> dict[str, str]:
+    """Reads the newest checkpoint of runs that are needed, so that a damaged one is set aside
+    itself, and not what would have been made from it.
+
+    Returns:
+      Those that were, and why.
+    """
     found = {}
-    for name in run.needs:
+    for name in names:
         checkpoints = Checkpointer(root / name / "checkpoints")
         if (newest := checkpoints.latest()) is None:
             continue
