@@ -128,10 +128,10 @@ def on_slurm(folder: Path) -> str:
     name, pid = in_the_middle(folder, lambda name: "fractional" in name)
     os.kill(pid, signal.SIGUSR2)
     _finish(process, folder)
-    logs = [path.read_text() for path in folder.glob(f"results/debug/{WORK}/slurm/*log.*")]
+    logs = [path.read_text() for path in folder.glob(f"results/debug/{WORK}/slurm/*_log.out")]
     requeued = sum("Requeued job" in log for log in logs)
     assert requeued, "no job was requeued"
-    return f"SIGUSR2 during {name}, {requeued} job requeued"
+    return f"SIGUSR2 during {name}, {requeued} job requeued and gone on with"
 
 
 def by_workers(folder: Path) -> str:
