@@ -23,6 +23,8 @@ class Purpose(enum.IntEnum):
     COLLECT = 2
     EVALUATE = 3
     DIAGNOSE = 4
+    ACT = 5
+    PREDICT = 6
 
 
 # Phases are numbered. What plays phases outside of a training has a range of numbers of its own,
@@ -78,12 +80,30 @@ def latent_key(seed: int, phase: int, task: int) -> jax.Array:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), phase), task)
 
 
+def acting_key(step: jax.Array | int) -> jax.Array:
+    """The key of an action of an agent that acts outside of a run, after so many of its episode.
+
+    It is the same in every episode, and for every agent: the same images get the same actions.
+    """
+    return jax.random.fold_in(member_key(0, Purpose.ACT), step)
+
+
+def prediction_key(member: jax.Array | int) -> jax.Array:
+    """The key of the prediction that a video shows of a member of a population."""
+    return jax.random.fold_in(member_key(0, Purpose.PREDICT), member)
+
+
 def hold_key(key: jax.Array) -> jax.Array:
     """A key to draw from beside `key`: it decides whether what was held before is kept.
 
     A key that is split must not be given: what `jax.random.split` makes second of it is this key.
     """
     return jax.random.fold_in(key, _HOLD)
+
+
+def choice_generator(seed: int) -> np.random.Generator:
+    """What chooses latent states among all that were inferred; a generator on the host."""
+    return np.random.Generator(np.random.PCG64(seed))
 
 
 def batch_generator(seed: int, update: int) -> np.random.Generator:

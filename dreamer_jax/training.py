@@ -9,10 +9,8 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 
 import dataclasses
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -33,6 +31,7 @@ from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect, episodes
 from dreamer_jax.run_folder import RunFolder
 from dreamer_jax.schedule import Counters, Schedule
+from dreamer_jax.stopping import StopRequest
 from dreamer_jax.video import tile, write_video
 from dreamer_jax.waiting import to_host
 
@@ -56,41 +55,6 @@ class Member:
 
 class NonFiniteError(FloatingPointError):
     """All members of a population have met losses or gradients that are not finite."""
-
-
-class StopRequest:
-    """Turns the first Ctrl-C (or SIGTERM, or the terminal's end) into a request to stop, and lets a
-    second one quit.
-
-    A context manager; outside the main thread it does nothing, as Python allows no more.
-
-    Args:
-      say: is told of the request in words.
-      hurry: called at the request, so that nothing that hangs is waited for.
-    """
-
-    def __init__(self, say: Callable[[str], None], hurry: Callable[[], None]):
-        self.requested = False
-        self._say, self._hurry = say, hurry
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> "StopRequest":
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
-                    self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *_) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number, frame) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-        self._hurry()
-        self._say("stopping: saving first (once more to quit without)")
 
 
 def _mean(values: Sequence[float]) -> float:

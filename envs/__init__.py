@@ -5,8 +5,7 @@ Importing this package also registers the tasks with gymnasium, as `bullet_pixel
 too.
 """
 
-from envs.base import Env, SimulatorError, TaskSpec, TimeStep
-from envs.pool import SIMULATOR_TIMEOUT
+from envs.base import SIMULATOR_TIMEOUT, Env, SimulatorError, TaskSpec, TimeStep
 from envs.registry import (
     described,
     make,

@@ -12,6 +12,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+SIMULATOR_TIMEOUT = 300.0
+"""Seconds after which a simulator that does not answer is taken for stuck, unless told otherwise.
+"""
+
 
 @dataclass(frozen=True)
 class TaskSpec:

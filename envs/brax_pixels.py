@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Outcome, SimulatorError, TaskSpec, TimeStep
+from envs.base import SIMULATOR_TIMEOUT, Outcome, SimulatorError, TaskSpec, TimeStep
 from envs.brax_episodes import episodes_of
 from envs.brax_physics import physics_of, task_scene
 from envs.bridge import HostCalls
-from envs.pool import SIMULATOR_TIMEOUT, SimulatorPool
+from envs.pool import SimulatorPool
 from envs.ray_casting import check_size, render
 from envs.registry import BRAX_ENGINES, BRAX_RENDERERS
 from envs.rows import (

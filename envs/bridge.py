@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import io_callback
 
-from envs.base import SimulatorError, TaskSpec, TimeStep
-from envs.pool import SIMULATOR_TIMEOUT, SimulatorPool
+from envs.base import SIMULATOR_TIMEOUT, SimulatorError, TaskSpec, TimeStep
+from envs.pool import SimulatorPool
 from envs.rows import action_words, check_slots, key_words, mapped_rows
 
 

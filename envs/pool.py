@@ -27,12 +27,8 @@ from typing import IO
 
 import numpy as np
 
-from envs.base import SimulatorError, TaskSpec, TimeStep
+from envs.base import SIMULATOR_TIMEOUT, SimulatorError, TaskSpec, TimeStep
 from envs.worker import ACTIVE_WAIT, StartFailure, WorkerSettings, record_type
-
-SIMULATOR_TIMEOUT = 300.0
-"""Seconds after which a simulator that does not answer is taken for stuck, unless told otherwise.
-"""
 
 # Seconds after which that is warned of (and again after twice as many), those that are left to a
 # simulator once whoever waits has asked not to wait. A process takes longer for its start, on a

@@ -9,9 +9,7 @@ from dataclasses import replace
 
 import gymnasium
 
-from envs.base import Env, TaskSpec
-from envs.gymnasium_simulator import gymnasium_task
-from envs.pool import SIMULATOR_TIMEOUT
+from envs.base import SIMULATOR_TIMEOUT, Env, TaskSpec
 
 # Returns of whole episodes at an action repeat of 2, from 20 episodes at random and 5 of the rest.
 # A saturated actor presses a pendulum's cart against an end of the rail (constant action); who
@@ -131,7 +129,12 @@ def spec(name: str) -> TaskSpec:
       ModuleNotFoundError: if a gymnasium environment needs a package that is not installed.
     """
     task = described(name)
-    return gymnasium_task(task.title) if is_gymnasium(name) else task
+    if not is_gymnasium(name):
+        return task
+    # Imported for those alone: a misspelt name is told without what reads and scales pictures.
+    from envs.gymnasium_simulator import gymnasium_task
+
+    return gymnasium_task(task.title)
 
 
 def is_gymnasium(name: str) -> bool:

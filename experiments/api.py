@@ -36,6 +36,7 @@ import envs
 from dreamer_jax import config as configs
 from dreamer_jax.agent import Agent, Carry
 from dreamer_jax.config import Config
+from dreamer_jax.randomness import acting_key
 from envs.pixel_env import PixelEnv
 from experiments import methods
 from experiments.runs import evaluate as evaluation
@@ -143,8 +144,7 @@ class Player:
 
 @functools.partial(jax.jit, static_argnames="agent")
 def _act(agent: Agent, params, memory: Memory, image: jax.Array) -> tuple[jax.Array, Memory]:
-    key = jax.random.fold_in(jax.random.key(0), memory.step)
-    first = memory.step == 0
+    key, first = acting_key(memory.step), memory.step == 0
     action, carry = agent.policy(params, memory.carry, image, first, key, "evaluate")
     return action, Memory(carry, memory.step + 1)
 

@@ -216,9 +216,7 @@ def test_ctrl_c_leaves_the_jobs_in_the_queue_and_says_how_to_cancel_them(tmp_pat
 @with_submitit
 def test_jobs_in_this_process_train_what_they_are_given_in_order(tmp_path, monkeypatch):
     trainer = Trainer()
-    monkeypatch.setattr(
-        jobs, "_train", lambda run, root, workers, accept_failed: trainer(run, root, workers)
-    )
+    monkeypatch.setattr(jobs, "_train", lambda run, root, workers, **_: trainer(run, root, workers))
     # What a process of its own settles for itself.
     monkeypatch.setattr(on_slurm.signal, "signal", lambda *_: None)
     monkeypatch.setattr(jobs, "keep_freed_memory", lambda: None)

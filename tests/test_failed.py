@@ -8,12 +8,14 @@ import pytest
 from experiments.cli.main import main
 from experiments.runs.agents import load_source
 from experiments.runs.export import export
+from experiments.runs.exported import read_card, read_params
 from experiments.runs.folder import failed_members
 from experiments.runs.start import load_sources
 from experiments.thesis import grid
 from experiments.thesis.estimate import plan_table
 from experiments.thesis.graph import plan_runs
 from runs import CONFIG, finish, spec_of, write_run
+from transfer_trees import bits
 
 
 def row(member, **columns):
@@ -60,9 +62,18 @@ def test_the_command_line_refuses_it_with_the_way_out(run, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_failed_agent_is_not_exported(run, tmp_path):
+def test_a_failed_agent_is_not_exported_unless_one_insists(run, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "agent.safetensors"
     with pytest.raises(ValueError, match="member 1 of .*run failed"):
-        export(run, tmp_path / "agent.safetensors", member=1)
+        export(run, file, member=1)
+    words = ["export", str(run), "--member", "1", "--out", str(file)]
+    assert main(words) == 2
+    assert "insist with --accept-failed" in capsys.readouterr().err and not file.exists()
+    played = {"bullet/hopper": (1.0, 2.0)}
+    monkeypatch.setattr("experiments.runs.export._play", lambda *_, **__: played)
+    assert main([*words, "--accept-failed"]) == 0
+    assert read_card(file).returns == played
+    assert bits(read_params(file)) == bits(load_source(run, 1, accept_failed=True).params)
 
 
 def test_a_plan_names_the_cells_that_failed(tmp_path):

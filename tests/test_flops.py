@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
-from experiments.thesis import estimate
+from experiments.thesis import measurement
 from experiments.thesis.flops import count
 
 
@@ -43,8 +43,8 @@ def test_a_large_update_is_sampled_on_smaller_batches_of_the_same_networks(monke
     config = preset("debug")
     learning = dataclasses.replace(config.learning, batch_size=8, sequence_length=20)
     agent = Agent(dataclasses.replace(config, learning=learning), 2)
-    monkeypatch.setattr(estimate, "SAMPLE_OPERATIONS", 1.0)
-    part, times = estimate.sample_of(agent)
+    monkeypatch.setattr(measurement, "SAMPLE_OPERATIONS", 1.0)
+    part, times = measurement.sample_of(agent)
     assert part.config.network == agent.config.network
     learning = part.config.learning
     assert (learning.batch_size, learning.sequence_length) == (2, 5)

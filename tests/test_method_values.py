@@ -121,6 +121,7 @@ def clipping(monkeypatch):
     class Clipping(Targets):
         NAME: ClassVar[str] = "clipping"
         SUMMARY: ClassVar[str] = "weights cut off"
+        COMPARED: ClassVar[bool] = True
         limits: tuple[float, ...] = setting((1.0,), "limit", "Largest weights.")
 
     found = dict(methods.known()) | {"clipping": Clipping}
@@ -149,3 +150,31 @@ def test_a_new_method_has_its_options_without_another_file_being_touched(clippin
     (spec,) = asked
     assert spec.method == clipping(sources=("a",), limits=(0.5, 2.0), baseline=True)
     assert main([*words[:-1], "--omega", "0.2"]) == 2
+
+
+@pytest.mark.parametrize("words", [["table", "7"], ["plan", "--table", "7"], ["seeds", "7"]])
+def test_tables_choose_rows_of_their_own_among_the_methods_that_say_so(
+    words, clipping, monkeypatch, capsys
+):
+    from experiments.cli.main import COMMANDS
+
+    asked = []
+    command = COMMANDS[words[0]]._replace(carry_out=lambda options: asked.append(options) or 0)
+    monkeypatch.setitem(COMMANDS, words[0], command)
+    assert main([*words, "--compared", "clipping", "fine-tuning"]) == 0
+    (options,) = asked
+    assert getattr(options, "sweep", options).compared == ("clipping", "fine-tuning")
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--compared", "uae"])
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    for name in ("fine-tuning", "frozen-source", "clipping"):
+        assert repr(name) in told
+
+
+def test_a_method_that_says_so_has_cells_of_a_table(clipping):
+    from experiments.thesis import grid
+
+    table = grid.beside(grid.TABLES["table-7"], grid.may_be_compared())
+    cells = grid.entries(table)["InvertedPendulum", 2, "clipping"]
+    assert {cell.method for cell in cells} == {"clipping"}

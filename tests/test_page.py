@@ -10,12 +10,12 @@ import pytest
 from dreamer_jax.video import write_video
 from envs import SimulatorError
 from experiments.cli import reports
-from experiments.reports import figures, findings, page, sheet
+from experiments.reports import figures, findings, folding, page, sheet
 from experiments.reports.classification import Classification, Share
 from experiments.reports.outcomes import read_outcomes
 from experiments.thesis import grid
 from experiments.thesis.contradictions import CONTRADICTIONS
-from experiments.thesis.grid import FIGURES, TABLES
+from experiments.thesis.grid import FIGURES, TABLES, ReturnsTable
 from made_up_results import baselines, rising, targets, write_folder
 
 SEEDS = (0, 1, 2, 3, 4)
@@ -45,7 +45,7 @@ def classified(table):
     shares = tuple(
         Share(threshold, scaled, task, task in table.known, 0.25, 0.75, 0.5)
         for threshold, scaled in ((50.0, 5.0), (70.0, 7.0), (90.0, 9.0), (None, 6.5))
-        for task in (*table.targets, *table.known)
+        for task in table.tasks
     )
     return Classification(table, 100, 23, shares)
 
@@ -116,7 +116,7 @@ def test_a_page_answers_first(text):
 
 
 def test_a_forest_plot_has_zero_and_the_interval_on_one_scale(root):
-    tables = [table for table in TABLES.values() if table.kind != "ltc"]
+    tables = [table for table in TABLES.values() if isinstance(table, ReturnsTable)]
     cells = [cell for table in tables for cell in grid.shown(table, SEEDS)]
     (finding,) = findings.findings(tables, read_outcomes(root, cells), SEEDS)
     part = page._forest("", finding.comparisons["overall"][TARGET])
@@ -193,8 +193,8 @@ def test_what_was_not_run_is_one_line(text):
     assert line == (
         "Not run: tables 1 to 6, 9 to 12, 14 to 17; figures 12 to 20, 22 to 35, 37 to 39."
     )
-    assert page.not_run(["table-1", "table-2", "figure-4"]) == "Not run: tables 1, 2; figures 4."
-    assert page.not_run([]) == ""
+    assert folding.not_run(["table-1", "table-2", "figure-4"]) == "Not run: tables 1, 2; figures 4."
+    assert folding.not_run([]) == ""
 
 
 def test_rows_and_columns_of_which_nothing_was_run_are_named_below_their_table(text):
@@ -209,7 +209,7 @@ def test_agents_from_scratch_alone_keep_no_row_of_a_table_of_several_targets(tmp
     cells = [grid.meta("bullet", "Ant", 3, seed, 0) for seed in SEEDS]
     write_folder(root, "ant", cells, rising)
     write_folder(root, "scratch", baselines(SEEDS), rising)
-    shown = page.folded("table-16", sheet.read_sheet(TABLES["table-16"], root, SEEDS))
+    shown = folding.folded("table-16", sheet.read_sheet(TABLES["table-16"], root, SEEDS))
     assert [name for name, _ in shown.rows] == ["Ant"]
     assert shown.header == ("", "3 Tasks", "Baseline")
     missing = "HalfCheetah, Hopper, InvertedPendulum, Walker2D, InvertedDoublePendulum"

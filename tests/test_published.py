@@ -59,10 +59,10 @@ def test_what_does_not_apply_is_none():
 def test_every_entry_that_a_table_shows_has_a_record_of_its_own(name):
     table = grid.TABLES[name]
     number = published.number(table)
-    if table.kind == "ltc":
+    if isinstance(table, grid.LatentTable):
         found = [
             classification(number, task, threshold)
-            for task in (*table.targets, *table.known)
+            for task in table.tasks
             for threshold in grid.THRESHOLDS
         ]
         metrics = {"novel", "known"}

@@ -49,6 +49,8 @@ def test_keys_of_all_purposes_members_tasks_phases_and_updates_differ():
             for phase in range(3)
             for task in range(3)
         ),
+        *(randomness.acting_key(step) for step in range(20)),
+        *(randomness.prediction_key(member) for member in range(20)),
     ]
     components = [randomness.component_key(keys[0], name) for name in COMPONENTS]
     assert len(set(map(words, [*keys, *components]))) == len(keys) + len(components)
@@ -72,12 +74,11 @@ def test_what_is_drawn_beside_a_key_is_not_what_is_drawn_from_it():
 
 
 def test_batches_of_other_seeds_and_updates_are_drawn_from_other_streams():
-    drawn = {
-        tuple(randomness.batch_generator(seed, update).integers(2**63, size=2))
-        for seed in range(10)
-        for update in range(10)
-    }
-    assert len(drawn) == 100
+    generators = [
+        *(randomness.batch_generator(seed, n) for seed in range(10) for n in range(10)),
+        *(randomness.choice_generator(seed) for seed in range(10)),
+    ]
+    assert len({tuple(one.integers(2**63, size=2)) for one in generators}) == 110
 
 
 def test_streams_are_those_of_runs_that_were_made_before():
@@ -92,13 +93,26 @@ def test_streams_are_those_of_runs_that_were_made_before():
     assert words(randomness.update_key(7, 9)) == words(update)
     found = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(jax.random.key(7), 4), 5), 1)
     assert words(randomness.diagnosis_key(7, 5, 1)) == words(found)
+    acting = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), 5), 9)
+    assert words(randomness.acting_key(9)) == words(acting)
+    chosen = randomness.choice_generator(7).permutation(20)
+    assert chosen.tolist() == np.random.default_rng(7).permutation(20).tolist()
+
+
+def attributes(path):
+    nodes = ast.walk(ast.parse(path.read_text()))
+    return {node.attr for node in nodes if isinstance(node, ast.Attribute)}
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "dreamer_jax").glob("*.py")), ids=lambda p: p.stem)
 def test_keys_and_generators_are_derived_in_one_file(path):
-    names = {
-        node.attr for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Attribute)
-    }  # fmt: skip
     if path.stem != "randomness":
-        assert not names & {"fold_in", "SeedSequence", "default_rng", "PRNGKey"}
+        assert not attributes(path) & {"fold_in", "SeedSequence", "default_rng", "PRNGKey"}
+
+
+# Generators are there for what is drawn of results, of which no agent and no simulator knows.
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "experiments").rglob("*.py")), ids=lambda p: "/".join(p.parts[-2:])
+)
+def test_experiments_derive_no_keys_of_their_own(path):
+    assert not attributes(path) & {"fold_in", "SeedSequence", "PRNGKey"}

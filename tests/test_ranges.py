@@ -13,6 +13,7 @@ from dreamer_jax import config as configs
 from dreamer_jax.config import Config, check_prefill, preset
 from dreamer_jax.ranges import Range, check_ranges, kinds_of, ranges, setting
 from experiments.cli.main import COMMANDS, main
+from experiments.cli.options import Simulators
 
 BAD = [0, -1, -40, 0.0, -0.5, math.nan, math.inf, -math.inf, 10**30, 1e300]
 GROUPS = {entry.name: entry.type for entry in dataclasses.fields(Config)}
@@ -45,7 +46,9 @@ def test_every_number_of_a_configuration_refuses_what_is_not_in_its_range(group)
             assert str(allowed[name]) in str(raised.value)
 
 
-@pytest.mark.parametrize("command", [command.options() for command in COMMANDS.values()])
+@pytest.mark.parametrize(
+    "command", [*(command.options() for command in COMMANDS.values()), Simulators]
+)
 def test_every_number_of_a_command_has_a_range(command):
     declared = {entry.name for entry in dataclasses.fields(command) if "range" in entry.metadata}
     assert set(numbers_of(command)) - {"from_checkpoint"} == declared

@@ -9,7 +9,7 @@ from experiments.cli import thesis
 from experiments.cli.main import main
 from experiments.runs.spec import RunSpec
 from experiments.thesis import speeds
-from experiments.thesis.estimate import Speed
+from experiments.thesis.measurement import Speed
 
 HOPPER = RunSpec(("bullet/hopper",), (0,), preset("debug"))
 ANT = RunSpec(("bullet/ant",), (0,), preset("debug"))
@@ -20,7 +20,7 @@ def measured(monkeypatch):
     """The tasks of each measurement that was asked for; each finds another speed."""
     found = []
 
-    def measure(specs, tell):
+    def measure(specs, tell, *, timeout):
         tasks = [task for spec in specs for task in spec.tasks]
         found.append(tasks)
         ticks = dict.fromkeys(tasks, 0.001 * len(found))

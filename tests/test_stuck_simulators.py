@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer_jax.training import StopRequest
+from dreamer_jax.stopping import StopRequest
 from dreamer_jax.waiting import to_host
 from envs import pool
 from envs.base import SimulatorError, TaskSpec

@@ -16,9 +16,10 @@ from experiments.runs.folder import folders
 from experiments.thesis import estimate, jobs
 from experiments.thesis.engines import local
 from experiments.thesis.engines.local import one_by_one
-from experiments.thesis.estimate import Speed, plan_table
+from experiments.thesis.estimate import plan_table
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, closure, shown
+from experiments.thesis.measurement import Speed
 from experiments.thesis.reservations import planned
 from experiments.thesis.sweep import carry_out_runs
 from runs import CONFIG, Trainer, finish
@@ -237,7 +238,7 @@ def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for
     monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device])
     monkeypatch.setattr(
-        estimate, "_compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
+        estimate, "compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
     )
     schedule = estimate.in_memory(targets.spec).config.schedule
     expected = ("auto", 1) if chunk is None else ("chunks", chunk)

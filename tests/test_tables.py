@@ -152,7 +152,7 @@ def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatc
 def test_shares_are_those_of_the_tables_with_thresholds_scaled_to_the_features(classified):
     table = TABLES["table-13"]
     shares = read_classification(classified, table).shares
-    assert [share.task for share in shares[:6]] == [*table.targets, *table.known]
+    assert [share.task for share in shares[:6]] == list(table.tasks)
     assert [share.threshold for share in shares[::6]] == [50, 70, 90, None]
     assert [share.scaled for share in shares[::6]][:3] == pytest.approx(
         [xi * 12 / 230 for xi in (50, 70, 90)]

@@ -256,9 +256,7 @@ PART = ["--preset", "debug", "--seeds", "0", "--counts", "2", "--omegas", "0.1"]
 def trainer(monkeypatch):
     """Trains in a moment what commands train."""
     trainer = Trainer()
-    monkeypatch.setattr(
-        jobs, "_train", lambda run, root, workers, accept_failed: trainer(run, root, workers)
-    )
+    monkeypatch.setattr(jobs, "_train", lambda run, root, workers, **_: trainer(run, root, workers))
     return trainer
 
 

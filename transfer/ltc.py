@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 Array = jax.Array
 
@@ -127,7 +128,7 @@ Array([ 0.4,  1. , 21. ], dtype=float32))
 
 
 @jax.jit
-def nearest(model: Classifier, latents: Array) -> Neighbours:
+def nearest(model: Classifier, latents: ArrayLike) -> Neighbours:
     """The K nearest stored samples; of samples equally far the first stored come first.
 
     Memory is bounded: queries are taken in chunks, and S queries x S samples x M is never held.
@@ -180,7 +181,7 @@ def vote(labels: Array) -> Array:
     return jnp.where(winners, labels, jnp.iinfo(labels.dtype).max).min(-1)
 
 
-def classify(model: Classifier, latents: Array, threshold: Any) -> Classification:
+def classify(model: Classifier, latents: ArrayLike, threshold: Any) -> Classification:
     """The task of each latent state, or `NOVEL` (equation 22).
 
     Args:
@@ -198,7 +199,7 @@ def classify(model: Classifier, latents: Array, threshold: Any) -> Classificatio
 
 
 @jax.jit
-def _classify(model: Classifier, latents: Array, threshold: Any) -> Classification:
+def _classify(model: Classifier, latents: ArrayLike, threshold: Any) -> Classification:
     if jnp.ndim(threshold):
         raise ValueError(
             f"Expected one threshold, got shape {jnp.shape(threshold)}; map over several with "

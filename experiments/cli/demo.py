@@ -8,9 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import STOPPED, usage_errors
+from experiments.cli.options import Simulators
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,7 @@ class Demo:
     """Of the targets, and of the agents from scratch."""
     preset: Literal["demo", "cpu", "debug"] = "demo"
     """Settings; debug runs in seconds, from a source of its own sizes."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
 
 
 def demo(command: Demo) -> int:
@@ -48,13 +50,14 @@ def demo(command: Demo) -> int:
     from experiments.runs.spec import RunSpec
 
     folder = command.results / command.preset / "demo"
+    workers, timeout = command.simulators.workers, command.simulators.simulator_timeout
     with usage_errors():
         source = load_source(command.source)
         method = FractionalTransfer(sources=(command.source,), omegas=command.omegas, baseline=True)
         spec = RunSpec(
             (command.task,), command.seeds, configs.preset(command.preset), method=method
         )
-        run = make_run(spec, folder, resume=True, workers=command.workers)
+        run = make_run(spec, folder, resume=True, workers=workers, timeout=timeout)
     if carry_out(run) == "stopped":
         print(f"stopped and saved in {folder}: the same command goes on")
         return STOPPED
@@ -65,10 +68,11 @@ def demo(command: Demo) -> int:
     print(summary.table(summary.summarise(outcome)) + "\n")
     panels = []
     try:
-        panels.append(showcase.source_panel(source, command.task, command.workers))
+        panels.append(showcase.source_panel(source, command.task, workers=workers, timeout=timeout))
     except ModuleNotFoundError as error:
         print(f"the video is without the source: {error}", file=sys.stderr)
-    panels += showcase.member_panels(load_agents(folder), outcome, command.workers)
+    agents = load_agents(folder)
+    panels += showcase.member_panels(agents, outcome, workers=workers, timeout=timeout)
     film = showcase.write_film(panels, folder / "videos" / "beside_each_other.mp4")
     for path in (*summary.plot_curves(outcome), film):
         print(f"wrote {path}")

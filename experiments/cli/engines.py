@@ -12,9 +12,11 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
+from experiments.cli.options import Simulators
 
 if TYPE_CHECKING:
     from experiments.thesis.engines import Engine
+    from experiments.thesis.graph import Graph
     from experiments.thesis.sweep import Progress
 
 
@@ -54,8 +56,7 @@ class Work:
 
     results: tyro.conf.Positional[Path]
     """The folder that holds the runs, such as results/cpu."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
 
@@ -94,29 +95,30 @@ def engine_of(execution: Execution) -> "Engine":
     return one_by_one
 
 
-def engine_options(execution: Execution, runs: Any, workers: int | None) -> dict[str, Any]:
+def engine_options(execution: Execution, runs: "Graph", simulators: Simulators) -> dict[str, Any]:
     """Keywords of `sweep.carry_out_runs`: the engine, and what runs get of it.
 
     Args:
       execution: the options.
       runs: from `graph.plan_runs`.
-      workers: simulator processes, if said.
+      simulators: options of simulators.
     """
-    engine = engine_of(execution)
+    engine, timeout = engine_of(execution), simulators.simulator_timeout
     if execution.executor == "local":
-        return {"engine": engine, "workers": workers}
+        return {"engine": engine, "workers": simulators.workers, "timeout": timeout}
     from experiments.thesis.engines import Resources
     from experiments.thesis.engines.demands import demands
 
     asked = Resources(execution.gpus, execution.cpus, execution.memory, execution.hours)
     return {
         "engine": engine,
-        "workers": workers or execution.cpus,
+        "workers": simulators.workers or execution.cpus,
+        "timeout": timeout,
         "resources": demands(runs, asked),
     }
 
 
-def chosen_run(runs: Any, name: str | None) -> Any:
+def chosen_run(runs: "Graph", name: str | None) -> "Graph":
     """The runs that are to be trained: all, or one.
 
     Raises:
@@ -156,7 +158,10 @@ def work(command: Work) -> int:
 
     keep_freed_memory()
     progress = sweep.work(
-        command.results, workers=command.workers, accept_failed=command.accept_failed
+        command.results,
+        workers=command.simulators.workers,
+        accept_failed=command.accept_failed,
+        timeout=command.simulators.simulator_timeout,
     )
     if progress.stopped:
         print("stopped and saved: the same command goes on")

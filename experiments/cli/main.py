@@ -17,7 +17,7 @@ from dreamer_jax.output import safe_output
 from dreamer_jax.ranges import check_ranges
 from experiments.cli import demo, engines, reports, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
-from experiments.cli.options import Base, read_base
+from experiments.cli.options import CONSTRUCTORS, Base, read_base
 
 PROGRAM = "python -m experiments"
 
@@ -149,6 +149,7 @@ def _parse(arguments: list[str], program: str) -> tuple[Command, Any]:
         args=arguments[1:],
         prog=f"{program} {name}",
         description=inspect.getdoc(options),
+        registry=CONSTRUCTORS,
     )
 
 

@@ -17,8 +17,10 @@ import tyro
 
 from dreamer_jax import config as configs
 from dreamer_jax.config import Config
+from dreamer_jax.ranges import setting
 from experiments import methods
 from experiments.methods import Method
+from experiments.thesis import grid
 
 Preset = Literal["thesis", "cpu", "demo", "debug"]
 DEFAULT_PRESET: Preset = "cpu"
@@ -27,6 +29,43 @@ _NUMBER = re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 ConfigFile = Annotated[Path | None, tyro.conf.arg(name="config")]
 """The option --config."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulators:
+    """Where tasks are simulated."""
+
+    workers: int | None = setting(None, 1, 10_000)
+    """Simulator processes; by default one per core."""
+    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
+    """Seconds after which a simulator that does not answer is taken for stuck; a run that trains is
+    saved and ended then."""
+
+
+class Compared(str):
+    """The name of a method that tables may show beside their own."""
+
+
+# What a command line chooses from is looked up when it is read.
+CONSTRUCTORS = tyro.constructors.ConstructorRegistry()
+"""How options of our own types are made from words."""
+
+
+@CONSTRUCTORS.primitive_rule
+def _compared_rule(
+    kind: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Compared] | None:
+    if kind.type is not Compared:
+        return None
+    names = grid.may_be_compared()
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(names)}}}",
+        instance_from_str=lambda words: Compared(words[0]),
+        is_instance=lambda value: value in names,
+        str_from_instance=lambda value: [value],
+        choices=names,
+    )
 
 
 @dataclasses.dataclass(frozen=True)

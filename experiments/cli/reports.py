@@ -3,7 +3,6 @@
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,10 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import UsageError, usage_errors
-from experiments.cli.options import DEFAULT_PRESET, Preset
+from experiments.cli.options import DEFAULT_PRESET, Compared, Preset
 from experiments.cli.thesis import chosen
 from experiments.thesis import grid
-from experiments.thesis.grid import Backend, Figure, Table
+from experiments.thesis.grid import Backend, Figure, LatentTable, ReturnsTable, Table
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Seeds:
     """The fractions that are to be compared; the fewer, the fewer seeds they need."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """The numbers of source tasks that are to be compared."""
-    compared: tuple[str, ...] = ()
+    compared: tuple[Compared, ...] = ()
     """Further methods that are to be compared, see `table`."""
     backend: Backend = "bullet"
     """The simulators."""
@@ -105,9 +104,9 @@ def report_all(root: Path, seeds: tuple[int, ...], backend: Backend) -> int:
     outcomes = read_outcomes(root, [cell for one in entries for cell in grid.shown(one, seeds)])
 
     def begun(entry: Table | Figure) -> bool:
-        if entry.kind == "ltc":
+        if isinstance(entry, LatentTable):
             return read_classification(root, entry, seeds) is not None
-        if isinstance(entry, Table):
+        if isinstance(entry, ReturnsTable):
             return comparison.transferred(entry, outcomes, seeds)
         return entry.kind != "tasks" and bool(figures.begun(entry, outcomes, seeds))
 
@@ -117,7 +116,7 @@ def report_all(root: Path, seeds: tuple[int, ...], backend: Backend) -> int:
 
 def _on_backend(backend: Backend) -> list[Table | Figure]:
     """All tables and figures on a simulator."""
-    everything = (*grid.TABLES.values(), *grid.FIGURES.values())
+    everything: tuple[Table | Figure, ...] = (*grid.TABLES.values(), *grid.FIGURES.values())
     return [grid.on_backend(entry, backend) for entry in everything]
 
 
@@ -170,24 +169,18 @@ def seeds(command: Seeds) -> int:
     from experiments.reports.sequential import looks
 
     with usage_errors():
-        tables = chosen(grid.TABLES, command.names, command.backend)
         steps = looks(command.group, command.most)
-        for table in tables:
-            if table.kind == "ltc":
+        tables = []
+        for table in chosen(grid.TABLES, command.names, command.backend):
+            if isinstance(table, LatentTable):
                 raise ValueError(f"{table.name} compares no returns: choose of 1 to 12, 16 and 17")
-        if not set(command.compared) <= set(grid.COMPARED):
-            raise ValueError(f"compared {command.compared} must be some of {grid.COMPARED}")
+            table = grid.restricted(table, command.omegas, command.counts)
+            tables.append(grid.beside(table, command.compared))
     root = command.results / command.preset
     on_disk = seeds_on_disk(root, _on_backend(command.backend), command.backend)
     open_seeds: set[int] = set()
+    asked = on_disk or (0,)
     for table in tables:
-        table = dataclasses.replace(
-            table,
-            omegas=tuple(omega for omega in table.omegas if omega in command.omegas),
-            counts=tuple(count for count in table.counts if count in command.counts),
-            compared=command.compared if table.kind == "ftl" else (),
-        )
-        asked = on_disk or (0,)
         outcomes = read_outcomes(root, grid.shown(table, asked))
         with usage_errors():
             needs = needed.needed(table, outcomes, asked, command.group, command.most)

@@ -24,6 +24,7 @@ from experiments.cli.options import (
     Base,
     ConfigFile,
     Preset,
+    Simulators,
     make_method,
     method_defaults,
     method_groups,
@@ -55,11 +56,7 @@ class Run:
     lists what there is."""
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
-    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
-    """Seconds after which a simulator that does not answer is taken for stuck, and the run saved
-    and ended."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
@@ -131,10 +128,7 @@ class Evaluate:
     """Episodes per agent and task."""
     video: bool = False
     """Write videos of an episode and of an open-loop prediction into the folder."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
-    simulator_timeout: float = setting(300.0, 0, 1e7, above=True)
-    """Seconds after which a simulator that does not answer is taken for stuck."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
@@ -178,8 +172,7 @@ class Classify:
     """Of episodes, actions and samples."""
     accept_failed: bool = False
     """Take agents whose losses were not finite any more, as they were before."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
@@ -224,9 +217,9 @@ def train(command: Train) -> int:
             spec,
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
-            workers=run.workers,
+            workers=run.simulators.workers,
             accept_failed=run.accept_failed,
-            timeout=run.simulator_timeout,
+            timeout=run.simulators.simulator_timeout,
             from_checkpoint=run.from_checkpoint,
         )
     if spec.method.needs:
@@ -273,8 +266,8 @@ def _evaluate(command: Evaluate) -> int:
             agents,
             command.episodes,
             video=command.video,
-            workers=command.workers,
-            timeout=command.simulator_timeout,
+            workers=command.simulators.workers,
+            timeout=command.simulators.simulator_timeout,
             report=report,
         )
     groups: dict[tuple, list] = {}
@@ -331,7 +324,8 @@ def classify(command: Classify) -> int:
                 features=command.features,
                 actors=actors,
                 seed=command.seed,
-                workers=command.workers,
+                workers=command.simulators.workers,
+                timeout=command.simulators.simulator_timeout,
                 report=report,
                 **request,
             )

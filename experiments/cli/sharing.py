@@ -10,6 +10,7 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import usage_errors
+from experiments.cli.options import Simulators
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,9 @@ class Export:
     """Episodes of each task to play for the card."""
     note: str = ""
     """A sentence for the card."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
+    accept_failed: bool = False
+    """Export an agent whose losses were not finite any more, as it was before."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
 
@@ -61,7 +63,9 @@ def export(command: Export) -> int:
             member=command.member,
             episodes=command.episodes,
             note=command.note,
-            workers=command.workers,
+            accept_failed=command.accept_failed,
+            workers=command.simulators.workers,
+            timeout=command.simulators.simulator_timeout,
             report=report,
         )
     for task in card.spec.tasks:

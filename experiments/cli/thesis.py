@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -23,9 +24,22 @@ from experiments.cli.engines import (
     tell_problems,
 )
 from experiments.cli.exits import STOPPED, usage_errors
-from experiments.cli.options import DEFAULT_PRESET, Base, ConfigFile, Preset, sequence
+from experiments.cli.options import (
+    DEFAULT_PRESET,
+    Base,
+    Compared,
+    ConfigFile,
+    Preset,
+    Simulators,
+    sequence,
+)
 from experiments.thesis import grid
-from experiments.thesis.grid import Backend, Figure, Table
+from experiments.thesis.grid import Backend, Figure, LatentTable, Shown, Table
+
+if TYPE_CHECKING:
+    from experiments.thesis.graph import Graph, PlannedRun
+    from experiments.thesis.speeds import Known
+    from experiments.thesis.sweep import Progress
 
 
 @dataclass(frozen=True)
@@ -43,13 +57,12 @@ class Sweep:
     """Train targets of these fractions only; what is left out is shown as not run."""
     counts: tuple[int, ...] = setting(grid.COUNTS, 1, 100)
     """Train targets of these numbers of source tasks only."""
-    compared: tuple[str, ...] = ()
-    """Other methods to train, too, from the same sources (any of fine-tuning, frozen-source), for
-    rows of their own in tables of fractional transfer."""
+    compared: tuple[Compared, ...] = ()
+    """Other methods to train, too, from the same sources, for rows of their own in tables of
+    fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
-    workers: int | None = setting(None, 1, 10_000)
-    """Simulator processes; by default one per core."""
+    simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     yes: bool = False
     """At a terminal: begin without a question, however long it takes."""
     accept_failed: bool = False
@@ -153,9 +166,7 @@ def plan_defaults(base: Base) -> Plan:
     return Plan(sweep=_sweep(base))
 
 
-def chosen(
-    entries: Mapping[str, Table | Figure], names: Sequence[str], backend: Backend
-) -> list[Table | Figure]:
+def chosen(entries: Mapping[str, Shown], names: Sequence[str], backend: Backend) -> list[Shown]:
     """The tables or figures of the given numbers, on a backend.
 
     Raises:
@@ -182,7 +193,7 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    beside = [_beside(entry, command.sweep) for entry in entries]
+    beside = [grid.beside(entry, command.sweep.compared) for entry in entries]
     return _make(beside, command.sweep, command.execution)
 
 
@@ -209,25 +220,11 @@ def _entries(
     with usage_errors():
         if not (table or figure):
             raise ValueError(f"nothing to {verb}: add --table 3, or --figure 12, or all of them")
-        entries = [
+        entries: list[Table | Figure] = [
             *(chosen(grid.TABLES, table, sweep.backend) if table else ()),
             *(chosen(grid.FIGURES, figure, sweep.backend) if figure else ()),
         ]
-    return [_beside(entry, sweep) for entry in entries]
-
-
-def _restricted(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
-    """A table or figure of the fractions and numbers of source tasks that are asked for."""
-    omegas = tuple(omega for omega in entry.omegas if omega in sweep.omegas)
-    counts = tuple(count for count in entry.counts if count in sweep.counts)
-    return dataclasses.replace(entry, omegas=omegas, counts=counts)
-
-
-def _beside(entry: Table | Figure, sweep: Sweep) -> Table | Figure:
-    """A table of fractional transfer with the methods of comparison that are asked for."""
-    if isinstance(entry, Table) and entry.kind == "ftl":
-        return dataclasses.replace(entry, compared=sweep.compared)
-    return entry
+    return [grid.beside(entry, sweep.compared) for entry in entries]
 
 
 def _cells(entries: Sequence[Table | Figure], sweep: Sweep) -> list[grid.Cell]:
@@ -245,13 +242,11 @@ def _cells(entries: Sequence[Table | Figure], sweep: Sweep) -> list[grid.Cell]:
         ):
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
-        if not set(sweep.compared) <= set(grid.COMPARED):
-            raise ValueError(f"compared {sweep.compared} must be some of {grid.COMPARED}")
-        entries = [_restricted(entry, sweep) for entry in entries]
+        entries = [grid.restricted(entry, sweep.omegas, sweep.counts) for entry in entries]
         return [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
 
 
-def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
+def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
     """The runs behind tables and figures, beside what others are at; nothing is reserved."""
     from experiments.thesis.graph import plan_runs
     from experiments.thesis.reservations import standing
@@ -261,7 +256,9 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep):
         return plan_runs(cells, sweep.config, sweep.root, standing(sweep.root))
 
 
-def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution):
+def _carry_out(
+    entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution
+) -> "tuple[Graph, Progress]":
     """Trains what is missing of tables and figures.
 
     Returns:
@@ -271,7 +268,7 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execu
       UsageError: results of other settings are there, or a simulator or an engine is not installed.
     """
     from dreamer_jax.host_memory import keep_freed_memory
-    from experiments.thesis.estimate import DUE
+    from experiments.thesis.graph import due
     from experiments.thesis.reservations import planned
     from experiments.thesis.sweep import carry_out_runs
 
@@ -281,11 +278,13 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execu
             check_execution(execution)
             runs = at_work.enter_context(planned(cells, sweep.config, sweep.root))
             wanted = chosen_run(runs, execution.run)
-            if execution.executor == "local" and any(run.state in DUE for run in wanted):
+            if execution.executor == "local" and due(wanted):
                 keep_freed_memory()
-            options = engine_options(execution, wanted, sweep.workers)
             progress = carry_out_runs(
-                wanted, sweep.root, accept_failed=sweep.accept_failed, **options
+                wanted,
+                sweep.root,
+                **engine_options(execution, wanted, sweep.simulators),
+                accept_failed=sweep.accept_failed,
             )
     if progress.stopped and not progress.left:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
@@ -294,17 +293,20 @@ def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execu
 
 def plan(command: Plan) -> int:
     """Shows the graph with an estimate."""
-    from experiments.thesis import estimate
+    from experiments.thesis import estimate, measurement
+    from experiments.thesis.graph import due
 
     sweep = command.sweep
     entries = _entries(command.table, command.figure, sweep, "plan")
     runs = _planned(entries, sweep)
+    left = due(runs)
+    timeout = sweep.simulators.simulator_timeout
     if command.json:
-        if command.measure:
-            _speed(runs, again=True)
+        if command.measure and left:
+            _speed(left, timeout, again=True)
         print(json.dumps(_as_json(runs, sweep), indent=1))
         return 0
-    known = _speed(runs, again=command.measure)
+    known = _speed(left, timeout, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed))
     if known is not None:
@@ -318,14 +320,15 @@ def plan(command: Plan) -> int:
         if known.speed.scaled > 1:
             print(
                 "The update was measured on smaller batches, and multiplied by "
-                f"{known.speed.scaled:.3g}: its time may be off by {estimate.SCALING_ERROR:.0%}."
+                f"{known.speed.scaled:.3g}: its time may be off by {measurement.SCALING_ERROR:.0%}."
             )
     return 0
 
 
-def _as_json(runs, sweep: Sweep) -> dict[str, object]:
+def _as_json(runs: "Graph", sweep: Sweep) -> dict[str, object]:
     """The graph as JSON holds it: what it is, and of each run what an engine asks."""
     from experiments.thesis.engines.demands import estimates
+    from experiments.thesis.graph import PlannedRun
     from experiments.thesis.speeds import cache_folder
 
     known = estimates(runs, cache_folder())
@@ -338,8 +341,8 @@ def _as_json(runs, sweep: Sweep) -> dict[str, object]:
                 "name": run.name,
                 "needs": run.needs,
                 "state": run.state,
-                "progress": run.progress,
-                "tasks": run.spec.tasks if run.spec else (),
+                "progress": run.progress if isinstance(run, PlannedRun) else None,
+                "tasks": run.spec.tasks if isinstance(run, PlannedRun) else None,
                 "cells": run.cells,
                 **{key: estimated.get(key) for key in ("seconds", "memory", "disk")},
             }
@@ -351,43 +354,40 @@ LONG_SECONDS = 3600.0
 """What takes longer is begun at a terminal only after a question."""
 
 
-def _speed(runs, again: bool = False):
-    """How fast this machine is at the runs that are due; None if none is."""
-    from experiments.thesis.estimate import DUE
+def _speed(left: "Sequence[PlannedRun]", timeout: float, again: bool = False) -> "Known":
+    """How fast this machine is at runs of which there is at least one."""
     from experiments.thesis.speeds import cache_folder, speed_of
-
-    due = [run.spec for run in runs if run.state in DUE]
-    if not due:
-        return None
 
     def report(number: int, count: int, what: str) -> None:
         if number == 1:
             print("measuring how fast this machine is:", file=sys.stderr)
         print(f"  [{number}/{count}] {what}", file=sys.stderr, flush=True)
 
-    return speed_of(due, cache_folder(), again=again, report=report)
+    specs = [run.spec for run in left]
+    return speed_of(specs, cache_folder(), again=again, timeout=timeout, report=report)
 
 
-def _may_begin(runs) -> bool:
+def _may_begin(runs: "Graph", timeout: float) -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
+    from experiments.thesis.graph import due
 
-    due = [run for run in runs if run.state in estimate.DUE]
+    left = due(runs)
     updates = sum(
         Schedule(run.spec.config.schedule, len(run.spec.tasks)).updates * len(run.spec.members)
-        for run in due
+        for run in left
     )
     # An update that takes a second is one of the largest sizes on a machine without accelerator.
     if updates < LONG_SECONDS:
         return True
-    speed = _speed(runs).speed
+    speed = _speed(left, timeout).speed
     total = estimate.together(runs, speed)
     if total.seconds < LONG_SECONDS:
         return True
-    agents = sum(len(run.cells) for run in due)
+    agents = sum(len(run.cells) for run in left)
     print(
-        f"{len(due)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
+        f"{len(left)} runs of {agents} agents will take {estimate.span(total.seconds, speed)}. "
         "They can be stopped with\nCtrl-C and go on with the same command; plan shows them one by "
         "one, --yes begins without asking."
     )
@@ -406,7 +406,7 @@ def _begins(entries: Sequence[Table | Figure], sweep: Sweep, execution: Executio
     runs = _planned(entries, sweep)
     with usage_errors():
         wanted = chosen_run(runs, execution.run)
-    if _may_begin(wanted):
+    if _may_begin(wanted, sweep.simulators.simulator_timeout):
         return True
     print("nothing was begun")
     return False
@@ -425,7 +425,7 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution)
         return tell_problems(progress)
     run_of = {cell: run.name for run in runs for cell in run.cells}
     for entry in entries:
-        if entry.kind != "ltc":
+        if not isinstance(entry, LatentTable):
             continue
         (cell,) = grid.shown(entry, sweep.seeds)
         if (name := run_of[cell.name]) in progress.failed | progress.skipped:
@@ -437,7 +437,8 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution)
                     sweep.root,
                     entry,
                     sweep.seeds[0],
-                    workers=sweep.workers,
+                    workers=sweep.simulators.workers,
+                    timeout=sweep.simulators.simulator_timeout,
                     accept_failed=sweep.accept_failed,
                     report=report,
                 )

@@ -144,6 +144,9 @@ class Method:
     """On the command line, in run.json and in the names of cells."""
     SUMMARY: ClassVar[str]
     """What it is, for the command line's help."""
+    COMPARED: ClassVar[bool] = False
+    """Whether tables of fractional transfer may show it beside their own: then a cell is made from
+    its source alone."""
 
     # Those that are settings of a method are fields there.
 

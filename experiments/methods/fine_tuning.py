@@ -13,6 +13,7 @@ class FineTuning(CopiedTargets):
 
     NAME: ClassVar[str] = "fine-tuning"
     SUMMARY: ClassVar[str] = "everything copied where shapes fit, and trained on"
+    COMPARED: ClassVar[bool] = True
 
     def plan(self, unfit: Collection[str] = OF_ACTIONS):
         """Copies all but what does not fit.

@@ -21,6 +21,7 @@ class FrozenSource(CopiedTargets):
 
     NAME: ClassVar[str] = "frozen-source"
     SUMMARY: ClassVar[str] = "everything copied where shapes fit, all but the heads frozen"
+    COMPARED: ClassVar[bool] = True
 
     def check_settings(self) -> None:
         """Checks the sources; what is frozen is frozen in all agents of a run.

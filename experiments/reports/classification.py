@@ -7,7 +7,7 @@ from pathlib import Path
 import envs
 from dreamer_jax.files import read_json
 from experiments.runs.folder import latents_folder
-from experiments.thesis.grid import SEEDS, THRESHOLDS, Table
+from experiments.thesis.grid import SEEDS, THRESHOLDS, LatentTable
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Classification:
       shares: for each threshold, the suggested one last, and each task, novel ones first.
     """
 
-    table: Table
+    table: LatentTable
     samples: int
     feature_size: int
     shares: tuple[Share, ...]
 
 
 def read_classification(
-    root: str | Path, table: Table, seeds: tuple[int, ...] = SEEDS
+    root: str | Path, table: LatentTable, seeds: tuple[int, ...] = SEEDS
 ) -> Classification | None:
     """What a table of latent task classification shows; None if that is not done yet."""
     path = latents_folder(root, table.backend, seeds[0]) / f"{table.name}.json"
@@ -76,7 +76,7 @@ def read_classification(
                 right_task=rows[applied, task]["right_task"],
             )
             for threshold, applied in zip((*THRESHOLDS, None), scaled, strict=True)
-            for task in (*table.targets, *table.known)
+            for task in table.tasks
         )
     except (ValueError, KeyError, TypeError) as error:
         warnings.warn(f"{path} cannot be read ({error}): delete it to make it anew", stacklevel=2)

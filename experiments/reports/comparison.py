@@ -19,7 +19,7 @@ from experiments.reports.outcomes import Outcome, curves
 from experiments.reports.statistics import Estimate
 from experiments.reports.verdicts import Verdict
 from experiments.thesis import grid, published
-from experiments.thesis.grid import Cell, Table
+from experiments.thesis.grid import Cell, Key, ReturnsTable
 from experiments.thesis.published import Published
 
 # Intervals are the same whenever and in whatever order tables are written.
@@ -155,16 +155,16 @@ class Entry:
 
 
 def compare(
-    table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
-) -> dict[tuple, Entry]:
+    table: ReturnsTable, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
+) -> dict[Key, Entry]:
     """The entries of a table of returns by their keys.
 
     Args:
-      table: of kind "ftl" or "meta".
+      table: which one.
       outcomes: of all cells that the table shows.
       seeds: of targets and baselines; the first one is the sources'.
     """
-    entries: dict[tuple, Entry] = {}
+    entries: dict[Key, Entry] = {}
     for key, cells in grid.entries(table, seeds).items():
         group = tuple(outcomes[cell] for cell in cells)
         base = entries.get((key[0], None, None))
@@ -172,7 +172,9 @@ def compare(
     return _with_verdicts(entries)
 
 
-def transferred(table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]) -> bool:
+def transferred(
+    table: ReturnsTable, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
+) -> bool:
     """Whether anything of a table of returns but its agents from scratch has begun."""
     return any(
         outcomes[cell].state != "missing"
@@ -182,9 +184,16 @@ def transferred(table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[
     )
 
 
-def _entry(table, key, outcomes, seeds, base: Entry | None) -> Entry:
-    target = key[0]
-    empty = Entry(*key, outcomes, seeds, published.returns(published.number(table), *key))
+def _entry(
+    table: ReturnsTable,
+    key: Key,
+    outcomes: tuple[Outcome, ...],
+    seeds: tuple[int, ...],
+    base: Entry | None,
+) -> Entry:
+    target, sources, variant = key
+    known = published.returns(published.number(table), target, sources, variant)
+    empty = Entry(target, sources, variant, outcomes, seeds, known)
     done = [outcome for outcome in outcomes if outcome.state == "done"]
     if not done:
         return empty
@@ -203,7 +212,7 @@ def _entry(table, key, outcomes, seeds, base: Entry | None) -> Entry:
     baselines = [outcome for outcome in base.outcomes if outcome.state == "done"]
     count = statistics.first_evaluations(done[0].planned)
     transfer = Transfer(
-        Estimate(scores.mean() - np.mean(base.scores), None, None),
+        Estimate(float(scores.mean() - np.mean(base.scores)), None, None),
         statistics.improvement(scores, np.array(base.scores)),
         statistics.jumpstart(curves(done, target)[1], curves(baselines, target)[1], count),
     )
@@ -211,12 +220,16 @@ def _entry(table, key, outcomes, seeds, base: Entry | None) -> Entry:
     return dataclasses.replace(entry, transfer=transfer, threshold=threshold)
 
 
-def _with_verdicts(entries: dict[tuple, Entry]) -> dict[tuple, Entry]:
+def _with_verdicts(entries: dict[Key, Entry]) -> dict[Key, Entry]:
     """Intervals of the differences, of each target's groups together, and what they say."""
-    chances: dict[tuple, float] = {}
-    found = dict(entries)
+    transfers: dict[Key, Transfer] = {}
+    chances: dict[Key, float] = {}
     for target in dict.fromkeys(entry.target for entry in entries.values()):
-        chosen = [key for key in entries if key[0] == target and entries[key].transfer]
+        chosen = {
+            key: entry.transfer
+            for key, entry in entries.items()
+            if entry.target == target and entry.transfer is not None
+        }
         if not chosen:
             continue
         base = entries[target, None, None].scores
@@ -224,17 +237,17 @@ def _with_verdicts(entries: dict[tuple, Entry]) -> dict[tuple, Entry]:
         differences = verdicts.differences(groups, np.array(base))
         for key, value, low, high, chance in zip(chosen, *differences, strict=True):
             ends = (float(low), float(high)) if np.isfinite(low) else (None, None)
-            transfer = dataclasses.replace(
-                entries[key].transfer, difference=Estimate(float(value), *ends)
-            )
-            found[key] = dataclasses.replace(entries[key], transfer=transfer)
+            difference = Estimate(float(value), *ends)
+            transfers[key] = dataclasses.replace(chosen[key], difference=difference)
             if min(len(base), len(entries[key].scores)) >= verdicts.LEAST_SEEDS:
                 chances[key] = float(chance)
     corrected = verdicts.holm(np.array(list(chances.values())))
     for key, chance in zip(chances, corrected, strict=True):
-        transfer = dataclasses.replace(found[key].transfer, chance=float(chance))
-        found[key] = dataclasses.replace(found[key], transfer=transfer)
-    return found
+        transfers[key] = dataclasses.replace(transfers[key], chance=float(chance))
+    return entries | {
+        key: dataclasses.replace(entries[key], transfer=transfer)
+        for key, transfer in transfers.items()
+    }
 
 
 def _threshold(done: Sequence[Outcome], baselines: Sequence[Outcome], target: str) -> Threshold:
@@ -264,7 +277,7 @@ class Aggregate:
 
 
 def across_targets(
-    tables: Sequence[dict[tuple, Entry]],
+    tables: Sequence[Mapping[Key, Entry]],
 ) -> tuple[list[str], list[Aggregate]]:
     """Joins entries of several targets, each target a stratum of the bootstrap.
 
@@ -275,12 +288,12 @@ def across_targets(
       The targets all of whose entries have seeds that are done, and one aggregate for each setting
       of the method, the baseline first; none without a target.
     """
-    by_target: dict[str, dict[tuple, Entry]] = {}
+    by_target: dict[str, dict[tuple[int | None, float | None], Entry]] = {}
     for entries in tables:
-        for (target, *setting), entry in entries.items():
+        for entry in entries.values():
             if entry.method is not None:
                 continue  # not of the table's own method
-            by_target.setdefault(target, {})[tuple(setting)] = entry
+            by_target.setdefault(entry.target, {})[entry.sources, entry.omega] = entry
     by_target = {
         target: group
         for target, group in by_target.items()
@@ -290,7 +303,11 @@ def across_targets(
         return [], []
     scaled = {
         target: dict(
-            zip(group, statistics.normalised([e.scores for e in group.values()]), strict=True)
+            zip(
+                group,
+                statistics.normalised([np.array(e.scores) for e in group.values()]),
+                strict=True,
+            )
         )
         for target, group in by_target.items()
     }

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.reports import comparison, curves, verdicts
-from experiments.reports.comparison import Entry
+from experiments.reports.comparison import Entry, Transfer
 from experiments.reports.outcomes import Outcome
 from experiments.reports.sheet import interval, verdict_word
-from experiments.thesis.grid import Cell, Metric, Table
+from experiments.thesis.grid import Cell, Metric, ReturnsTable
 
 METHODS = {"ftl": "Fractional transfer", "meta": "Reward meta-models"}
 """What the own methods of tables are called, by their kinds."""
@@ -24,13 +24,15 @@ class Comparison:
 
     Attributes:
       metric: of the returns.
-      entry: the transfer, which has been compared.
+      entry: the agents that transferred.
       baseline: the agents from scratch on the same task.
+      transfer: what came of comparing both.
     """
 
     metric: Metric
     entry: Entry
     baseline: Entry
+    transfer: Transfer
 
     @property
     def seeds(self) -> str:
@@ -62,20 +64,18 @@ class Finding:
 
 
 def findings(
-    tables: Iterable[Table], outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
+    tables: Iterable[ReturnsTable], outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
 ) -> list[Finding]:
     """What there is on each method of which anything was run.
 
     Args:
-      tables: of which comparisons are taken; those of latent task classification have none.
+      tables: of which comparisons are taken.
       outcomes: of all cells that they show.
       seeds: of targets and baselines; the first one is the sources'.
     """
     begun: set[tuple[str, str]] = set()
     found: dict[tuple[str, str], dict[Metric, dict[str, list[Comparison]]]] = {}
     for table in tables:
-        if table.kind not in METHODS:
-            continue
         entries = comparison.compare(table, outcomes, seeds)
         for entry in entries.values():
             if entry.sources is None:
@@ -88,14 +88,15 @@ def findings(
                 begun.add(key)
             if entry.transfer is not None:
                 group = by_metric.setdefault(table.metric, {}).setdefault(entry.target, [])
-                group.append(Comparison(table.metric, entry, entries[entry.target, None, None]))
+                base = entries[entry.target, None, None]
+                group.append(Comparison(table.metric, entry, base, entry.transfer))
     told = []
     for (kind, method), by_metric in found.items():
         if (kind, method) not in begun:
             continue
         groups = [group for targets in by_metric.values() for group in targets.values()]
         for group in groups:
-            group.sort(key=lambda one: (one.entry.sources, one.entry.omega or 0.0))
+            group.sort(key=lambda one: (one.entry.sources or 0, one.entry.omega or 0.0))
         words = sentence(method, [one for group in groups for one in group])
         told.append(Finding(kind, method, words, by_metric))
     return told
@@ -112,7 +113,7 @@ def sentence(method: str, comparisons: Sequence[Comparison]) -> str:
         f"{count} comparison{'s' if count > 1 else ''} with agents from scratch ({targets}; "
         f"{metrics} return)"
     )
-    judged = [c for c in comparisons if c.entry.transfer.chance is not None]
+    judged = [(c.transfer.chance, c) for c in comparisons if c.transfer.chance is not None]
     least = verdicts.LEAST_SEEDS
     if not judged:
         return (
@@ -120,15 +121,15 @@ def sentence(method: str, comparisons: Sequence[Comparison]) -> str:
             f"and none of {there} has them."
         )
     positive, negative = (
-        sum(c.entry.transfer.verdict == verdict for c in judged)
+        sum(c.transfer.verdict == verdict for _, c in judged)
         for verdict in ("positive", "negative")
     )
     undecided, few = len(judged) - positive - negative, count - len(judged)
-    best = min(judged, key=lambda c: c.entry.transfer.chance)
+    _, best = min(judged, key=lambda pair: pair[0])
     told = (
         f"{best.entry.full_name}, {best.metric} return: "
-        f"{interval(best.entry.transfer.difference, sign='+')}, better in "
-        f"{best.entry.transfer.improvement.value:.0%} of pairs of runs, {best.seeds} seeds"
+        f"{interval(best.transfer.difference, sign='+')}, better in "
+        f"{best.transfer.improvement.value:.0%} of pairs of runs, {best.seeds} seeds"
     )
     rest = f" ({few} more have too few seeds)" if few else ""
     if positive + negative == 0:
@@ -166,10 +167,10 @@ def scale(comparisons: Iterable[Comparison]) -> Scale:
     Intervals of two or three seeds are so wide that they would press the others together: the axis
     reaches at most twice as far as the other ends.
     """
-    ends, wide = [0.0], []
+    ends, wide = [0.0], list[float]()
     for one in comparisons:
-        value, low, high = one.entry.transfer.difference
-        enough = one.entry.transfer.chance is not None
+        value, low, high = one.transfer.difference
+        enough = one.transfer.chance is not None
         ends.append(value)
         (ends if enough else wide).extend(end for end in (low, high) if end is not None)
     reach = 2 * max(map(abs, ends)) or 1.0
@@ -210,9 +211,8 @@ def draw_forest(finding: Finding, stem: Path, size: str | None = None) -> list[P
     )
     for row, target in zip(axes, targets, strict=True):
         for axis, metric in zip(row, metrics, strict=True):
-            _draw_target(
-                axis, f"{target}, {metric} return", finding.comparisons[metric].get(target)
-            )
+            comparisons = finding.comparisons[metric].get(target, ())
+            _draw_target(axis, f"{target}, {metric} return", comparisons)
     title = f"{finding.method}: difference to agents from scratch, 95 % intervals"
     title += "" if size is None else f"\n({size})"
     picture.suptitle(curves.wrapped(title, width))
@@ -226,7 +226,7 @@ def _draw_target(axis, title: str, comparisons: Sequence[Comparison]) -> None:
     extent = scale(comparisons)
     axis.axvline(0, color="black", linewidth=0.8)
     for number, one in enumerate(comparisons):
-        value, low, high = one.entry.transfer.difference
+        value, low, high = one.transfer.difference
         colour = COLOURS.get(one.word, UNDECIDED)
         decided = one.word in COLOURS
         if low is not None:
@@ -234,7 +234,7 @@ def _draw_target(axis, title: str, comparisons: Sequence[Comparison]) -> None:
         axis.plot(
             value, number, "o", color=colour, markerfacecolor=colour if decided else "white", ms=6
         )
-        better = interval(one.entry.transfer.improvement, 2)
+        better = interval(one.transfer.improvement, 2)
         axis.annotate(
             f"{one.seeds:>7}   {better}",
             (1.02, number),

@@ -10,7 +10,7 @@ from experiments.reports.comparison import Entry
 from experiments.reports.outcomes import Outcome
 from experiments.reports.sequential import Decision
 from experiments.runs.text import aligned
-from experiments.thesis.grid import Cell, Table
+from experiments.thesis.grid import Cell, ReturnsTable
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Need:
 
 
 def needed(
-    table: Table,
+    table: ReturnsTable,
     outcomes: Mapping[Cell, Outcome],
     seeds: Sequence[int],
     group: int = sequential.GROUP,
@@ -45,7 +45,7 @@ def needed(
     numbers of sources that nobody means to run.
 
     Args:
-      table: of kind "ftl" or "meta".
+      table: which one.
       outcomes: of all cells that it shows.
       seeds: that there are; the first one is the sources'.
       group, most: see `sequential.decide`.

@@ -143,10 +143,12 @@ def read_outcomes(root: str | Path, cells: Iterable[Cell]) -> dict[Cell, Outcome
     runs = _read({places[cell.name][0]: None for cell in cells if cell.name in places})
     outcomes = {}
     for cell in cells:
-        folder, member = places.get(cell.name, (None, 0))
+        outcomes[cell] = Outcome()
+        if cell.name not in places:
+            continue
+        folder, member = places[cell.name]
         run = runs.get(folder)
         if run is None or member >= len(run.outcomes):
-            outcomes[cell] = Outcome()
             continue
         one = run.outcomes[member]
         by_title = {envs.described(task).title: returns for task, returns in one.returns.items()}

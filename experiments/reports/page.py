@@ -7,10 +7,8 @@ was not run is named in one line. What the page looks like is in page.html.j2 an
 
 import base64
 import functools
-import itertools
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,11 +22,10 @@ from experiments.reports.classification import read_classification
 from experiments.reports.comparison import Aggregate
 from experiments.reports.films import Film, films
 from experiments.reports.findings import Comparison, Finding, findings, scale
+from experiments.reports.folding import folded, not_run
 from experiments.reports.outcomes import Outcome, Run, read_outcomes, read_runs, states
 from experiments.reports.sheet import (
     STATISTICS_CAPTION,
-    Box,
-    Sheet,
     classification_sheet,
     interval,
     returns_sheet,
@@ -40,28 +37,19 @@ from experiments.runs.folder import CELLS, latents_folder
 from experiments.runs.folder import folders as places
 from experiments.thesis import grid, published
 from experiments.thesis.contradictions import CONTRADICTIONS
-from experiments.thesis.grid import FIGURES, TABLES, TASKS, Backend, Cell, Figure, Table
+from experiments.thesis.grid import (
+    FIGURES,
+    TABLES,
+    TASKS,
+    Backend,
+    Cell,
+    Figure,
+    LatentTable,
+    ReturnsTable,
+)
 
 LARGEST_VIDEOS = 16 * 2**20
 """Bytes of all videos together; what does not fit is left out and named."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A table as the page shows it: without the rows and columns of which nothing was run.
-
-    Attributes:
-      name: such as "table-3".
-      sheet: the whole of it.
-      header, rows: what is shown; each box with the number of columns that it spans.
-      notes: the sheet's, and what is not shown.
-    """
-
-    name: str
-    sheet: Sheet
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[tuple[Box | None, int], ...]], ...]
-    notes: tuple[str, ...]
 
 
 class Picture(NamedTuple):
@@ -115,7 +103,7 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
     cells = grid.closure(asked)
     # What is not comparable is said at the top, once.
     runs, outcomes, size = read_runs(root), read_outcomes(root, cells), size_note(root)
-    returns = [table for table in tables if table.kind != "ltc"]
+    returns = [table for table in tables if isinstance(table, ReturnsTable)]
     shown = [
         folded(table.name, returns_sheet(table, outcomes, seeds, None))
         for table in returns
@@ -124,7 +112,8 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
     classified = [
         (folded(table.name, classification_sheet(table, found, None)), _latents(table, root, seeds))
         for table in tables
-        if table.kind == "ltc" and (found := read_classification(root, table, seeds)) is not None
+        if isinstance(table, LatentTable)
+        and (found := read_classification(root, table, seeds)) is not None
     ]
     curves = [
         _curves(figure, outcomes, seeds)
@@ -134,20 +123,25 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
     tasks = [_tasks(figure) for figure in pictures if figure.kind == "tasks"]
     together = _together(returns, outcomes, seeds)
     videos, left_out = _films(runs)
-    there = {one.name for one in (*shown, *curves, *tasks)} | {one.name for one, _ in classified}
     folders, versions = _provenance(root, runs)
     state = states(outcomes.values())
     evaluations = sum(len(outcome.env_steps) for outcome in outcomes.values())
+    named = {
+        "tables": [one.name for one in shown],
+        "ltc": [one.name for one, _ in classified],
+        "curves": [one.name for one in curves],
+        "tasks": [one.name for one in tasks],
+    }
     sections = [
         ("tables", "Tables", shown),
-        ("ltc", "Latent task classification", [one for one, _ in classified]),
+        ("ltc", "Latent task classification", classified),
         ("curves", "Learning curves", curves),
-        ("together", "All targets together", together and ()),
-        ("videos", "Videos", (videos or left_out) and ()),
+        ("together", "All targets together", together),
+        ("videos", "Videos", videos or left_out),
         ("tasks", "The tasks", tasks),
-        ("reading", "How to read this", ()),
-        ("contradictions", "Contradictions of the thesis", ()),
-        ("provenance", "Where the numbers come from", ()),
+        ("reading", "How to read this", True),
+        ("contradictions", "Contradictions of the thesis", True),
+        ("provenance", "Where the numbers come from", True),
     ]
     return {
         "style": Path(__file__).with_name("page.css").read_text(encoding="utf-8"),
@@ -166,14 +160,18 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
         "least_seeds": LEAST_SEEDS,
         "statistics_caption": STATISTICS_CAPTION,
         "contents": [
-            ({"id": id, "text": text}, [(one.name, one.name.replace("-", " ")) for one in entries])
-            for id, text, entries in sections
-            if entries or (entries == () and id not in ("tables", "ltc", "curves"))
+            ({"id": id, "text": text}, [(x, x.replace("-", " ")) for x in named.get(id, ())])
+            for id, text, there in sections
+            if there
         ],
         "tables": shown,
         "classification": classified,
         "curves": curves,
-        "not_run": not_run(one.name for one in (*tables, *pictures) if one.name not in there),
+        "not_run": not_run(
+            one.name
+            for one in (*tables, *pictures)
+            if not any(one.name in names for names in named.values())
+        ),
         "together": together,
         "films": videos,
         "films_left_out": left_out,
@@ -188,69 +186,6 @@ def _values(root: Path, seeds: tuple[int, ...], backend: Backend) -> dict[str, A
 
 def _seeds(seeds: Sequence[int]) -> str:
     return f"seed{'s' if len(seeds) != 1 else ''} {', '.join(map(str, sorted(seeds))) or 'none'}"
-
-
-# --- tables ---------------------------------------------------------------------------------------
-
-
-def folded(name: str, sheet: Sheet) -> Shown:
-    """A table without the rows and columns of which nothing was run; these are named in a note.
-
-    Agents from scratch alone keep no row of a table of several targets. In a table of one target
-    they have a row of their own, whose one box spans all columns.
-    """
-
-    def begun(box: Box | None) -> bool:
-        return box is not None and box.begun and not box.baseline
-
-    alone = [row for row in sheet.rows if all(box is None or box.baseline for box in row[1])]
-    others = [row for row in sheet.rows if row not in alone]
-    kept = [row for row in others if any(map(begun, row[1]))]
-    columns = [
-        column
-        for column in range(len(sheet.header) - 1)
-        if any(begun(box) or (box and box.baseline) for box in (row[1][column] for row in kept))
-    ]
-    rows = [
-        (title, tuple((_shortened(boxes[column]), 1) for column in columns))
-        for title, boxes in kept
-    ]
-    rows += [(title, ((boxes[0], max(1, len(columns))),)) for title, boxes in alone]
-    header = (sheet.header[0], *(sheet.header[column + 1] for column in columns))
-    names = {title for title, _ in kept}
-    left_out = [title for title, _ in others if title not in names]
-    words = [f"{sheet.header[0]} {', '.join(left_out)}".strip()] if left_out else []
-    words += [text for text in sheet.header[1:] if text not in header]
-    notes = (*sheet.notes, *([f"Not run: {'; '.join(words)}."] if words else []))
-    return Shown(name, sheet, header, tuple(rows), notes)
-
-
-def _shortened(box: Box | None) -> Box | None:
-    """A box of which nothing was run says so with a dash."""
-    if box is None or box.begun:
-        return box
-    return Box("–", box.published, False, begun=False)
-
-
-def not_run(names: Iterable[str]) -> str:
-    """Names of tables and figures in one line, neighbours joined; "" without any."""
-    found: dict[str, list[int]] = {}
-    for name in names:
-        kind, _, number = name.partition("-")
-        found.setdefault(kind, []).append(int(number))
-    words = [f"{kind}s {_ranges(numbers)}" for kind, numbers in found.items()]
-    return f"Not run: {'; '.join(words)}." if words else ""
-
-
-def _ranges(numbers: Sequence[int]) -> str:
-    """Ascending numbers as "1 to 3, 5"."""
-    found = []
-    for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
-        first, *rest = [number for _, number in group]
-        found.append(
-            f"{first} to {rest[-1]}" if len(rest) > 1 else ", ".join(map(str, [first, *rest]))
-        )
-    return ", ".join(found)
 
 
 # --- at a glance ----------------------------------------------------------------------------------
@@ -275,7 +210,7 @@ def _forest(title: str, comparisons: Sequence[Comparison]) -> dict[str, Any]:
 
     rows = []
     for one in comparisons:
-        transfer = one.entry.transfer
+        transfer = one.transfer
         value, low, high = transfer.difference
         rows.append(
             {
@@ -319,7 +254,7 @@ def _tasks(figure: Figure) -> Picture:
         return Picture(figure.name, caption, _data("image/png", picture))
 
 
-def _latents(table: Table, root: Path, seeds: Sequence[int]) -> Picture | None:
+def _latents(table: LatentTable, root: Path, seeds: Sequence[int]) -> Picture | None:
     """The picture of latent states that classification leaves beside its numbers, if it has."""
     picture = latents_folder(root, table.backend, seeds[0]) / f"{table.name}.png"
     if not picture.exists():
@@ -360,7 +295,7 @@ def _film_name(film: Film) -> str:
 
 
 def _together(
-    tables: Sequence[Table], outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
+    tables: Sequence[ReturnsTable], outcomes: Mapping[Cell, Outcome], seeds: Sequence[int]
 ) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
     """Each setting of a method over all targets all of whose agents are there: title, targets and
     rows of each method and metric that has any."""
@@ -393,7 +328,8 @@ def _provenance(
     root: Path, runs: Mapping[Path, Run]
 ) -> tuple[list[tuple[str, str, str, str, str]], list[str]]:
     """Each results folder: its agents, evaluations, revision and number of versions; and these."""
-    rows, versions = [], {}
+    rows: list[tuple[str, str, str, str, str]] = []
+    versions: dict[str, int] = {}
     for folder in sorted({path.parent for path in root.glob(f"*/{CELLS}")}):
         if folder not in runs:
             rows.append((folder.name, "-", "-", "cannot be read", "-"))

@@ -13,7 +13,7 @@ from experiments.reports.sheet import STATISTICS_CAPTION, Sheet, read_sheet, siz
 from experiments.runs.folder import folders
 from experiments.runs.text import aligned
 from experiments.thesis import grid
-from experiments.thesis.grid import Backend, Figure, Table
+from experiments.thesis.grid import Backend, Figure, ReturnsTable, Table
 
 
 def write_table(table: Table, root: str | Path, seeds: Sequence[int], folder: str | Path) -> str:
@@ -83,7 +83,7 @@ def write_forests(
     tables = [
         grid.with_compared(grid.on_backend(table, backend), held, seeds)
         for table in grid.TABLES.values()
-        if table.kind != "ltc"
+        if isinstance(table, ReturnsTable)
     ]
     outcomes = read_outcomes(root, [cell for table in tables for cell in grid.shown(table, seeds)])
     size, written = size_note(root), []

@@ -17,7 +17,7 @@ from experiments.reports.statistics import Estimate
 from experiments.reports.verdicts import LEAST_SEEDS, Verdict
 from experiments.thesis import grid, published
 from experiments.thesis.graph import changed_settings
-from experiments.thesis.grid import Cell, Table
+from experiments.thesis.grid import Cell, LatentTable, ReturnsTable, Table
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Sheet:
 
 def read_sheet(table: Table, root: Path, seeds: tuple[int, ...]) -> Sheet:
     """A table from the results folders under a root."""
-    if table.kind == "ltc":
+    if isinstance(table, LatentTable):
         found = read_classification(root, table, seeds)
         return classification_sheet(table, found, size_note(root))
     outcomes = read_outcomes(root, grid.shown(table, seeds))
@@ -113,7 +113,7 @@ def _common_notes(table: Table, size: str | None) -> list[str]:
 
 
 def returns_sheet(
-    table: Table, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int], size: str | None
+    table: ReturnsTable, outcomes: Mapping[Cell, Outcome], seeds: Sequence[int], size: str | None
 ) -> Sheet:
     """Tables 1 to 12, 16 and 17, and the demo's."""
     entries = comparison.compare(table, outcomes, seeds)
@@ -122,7 +122,7 @@ def returns_sheet(
         (target,) = table.targets
         title = f"{_title(table)}: {target}, {table.metric} return"
         header = ("ω", *columns)
-        rows = [
+        rows: list[tuple[str, tuple[Box | None, ...]]] = [
             (f"{omega:.1f}", tuple(_box(entries[target, n, omega]) for n in table.counts))
             for omega in table.omegas
         ]
@@ -133,7 +133,7 @@ def returns_sheet(
             )
             for method in table.compared
         ]
-        empty = (None,) * (len(table.counts) - 1)
+        empty = [None] * (len(table.counts) - 1)
         rows.append(("Baseline", (_box(entries[target, None, None]), *empty)))
     else:
         title = f"{_title(table)}: reward meta-models, {table.metric} return"
@@ -263,7 +263,7 @@ def _statistics(entries: Iterable[Entry]) -> tuple[tuple[str, ...], ...]:
     return (header, *rows) if rows else ()
 
 
-def _record(table: Table, entry: Entry) -> dict[str, object]:
+def _record(table: ReturnsTable, entry: Entry) -> dict[str, object]:
     record: dict[str, object] = {
         "table": table.name,
         "target": entry.target,
@@ -287,8 +287,11 @@ def _record(table: Table, entry: Entry) -> dict[str, object]:
         "improvement": transfer and transfer.improvement,
     }
     for name, estimate in estimates.items():
-        values = (None,) * 3 if estimate is None else estimate
-        record |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+        record |= {
+            name: estimate and estimate.value,
+            f"{name}_low": estimate and estimate.low,
+            f"{name}_high": estimate and estimate.high,
+        }
     return record | {
         "chance": transfer and transfer.chance,
         "verdict": transfer and transfer.verdict,
@@ -301,7 +304,9 @@ def _record(table: Table, entry: Entry) -> dict[str, object]:
 # --- latent task classification -------------------------------------------------------------------
 
 
-def classification_sheet(table: Table, found: Classification | None, size: str | None) -> Sheet:
+def classification_sheet(
+    table: LatentTable, found: Classification | None, size: str | None
+) -> Sheet:
     """Tables 13 to 15.
 
     Args:
@@ -309,13 +314,13 @@ def classification_sheet(table: Table, found: Classification | None, size: str |
       found: the `outcomes.Classification`; None if it has not been made.
       size: from `size_note`.
     """
-    tasks, number = (*table.targets, *table.known), published.number(table)
+    number = published.number(table)
     shares = {} if found is None else {(s.threshold, s.task): s for s in found.shares}
     suggested = [share for share in shares.values() if share.threshold is None]
     rows, records = [], []
     for threshold in (*grid.THRESHOLDS, *([None] if suggested else [])):
         boxes = []
-        for task in tasks:
+        for task in table.tasks:
             known, share = task in table.known, shares.get((threshold, task))
             told = None if threshold is None else published.classification(number, task, threshold)
             boxes.append(
@@ -349,10 +354,10 @@ def classification_sheet(table: Table, found: Classification | None, size: str |
             f"thresholds were scaled by {found.feature_size} / 230."
         )
     return Sheet(
-        f"{_title(table)}: latent task classification, novel tasks {' and '.join(table.targets)}",
+        f"{_title(table)}: latent task classification, novel tasks {' and '.join(table.novel)}",
         "Novel tasks: share of samples taken for novel. Previous tasks: share not taken for novel "
         "/ share taken for the right task.",
-        ("Threshold", *(f"{task}, novel" for task in table.targets), *table.known),
+        ("Threshold", *(f"{task}, novel" for task in table.novel), *table.known),
         tuple(rows),
         (),
         tuple(notes),

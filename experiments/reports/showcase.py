@@ -65,10 +65,12 @@ def effects(run: Run, task: str) -> list[Effect]:
         reached = np.flatnonzero(curve.mean(axis=0) >= last)
         told.append(
             Effect(
-                label,
-                *(float(x[i]) for x in (found.value, found.low, found.high)),
-                verdicts.verdict(found.value[i], corrected[i]) if enough else None,
-                int(steps[reached[0]]) if len(reached) else None,
+                label=label,
+                difference=float(found.value[i]),
+                low=float(found.low[i]),
+                high=float(found.high[i]),
+                verdict=verdicts.verdict(found.value[i], corrected[i]) if enough else None,
+                reached=int(steps[reached[0]]) if len(reached) else None,
             )
         )
     return told
@@ -136,13 +138,20 @@ class Panel(NamedTuple):
     frames: np.ndarray
 
 
-def source_panel(source: Source, task: str, workers: int | None = None) -> Panel:
+def source_panel(
+    source: Source,
+    task: str,
+    *,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+) -> Panel:
     """An episode of a source agent on the one of its tasks that is most like a target's.
 
     Args:
       source: of plain networks.
       task: the target's name.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
 
     Raises:
       ModuleNotFoundError: the task's simulator is not installed.
@@ -153,20 +162,27 @@ def source_panel(source: Source, task: str, workers: int | None = None) -> Panel
     own = (alike or list(source.spec.tasks))[0]
     spec = RunSpec((own,), (0,), source.spec.config)
     params = jax.tree.map(lambda x: jnp.asarray(x)[None], source.params)
-    records = play(Agents(source.directory, spec, params), workers=workers)
+    records = play(Agents(source.directory, spec, params), workers=workers, timeout=timeout)
     score = records.reward[0, 0].sum()
     return Panel(f"source on {own}\nreturn {score:.0f}", records.image[0, 0])
 
 
-def member_panels(agents: Agents, run: Run, workers: int | None = None) -> list[Panel]:
+def member_panels(
+    agents: Agents,
+    run: Run,
+    *,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+) -> list[Panel]:
     """An episode of the middle one of each group of a run's agents, by their scores.
 
     Args:
       agents: the run's population, on one task.
       run: their evaluations.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
     """
-    records = play(agents, workers=workers)
+    records = play(agents, workers=workers, timeout=timeout)
     groups: dict[str, list[int]] = {}
     for place, member in enumerate(run.spec.members):
         groups.setdefault(member.label, []).append(place)

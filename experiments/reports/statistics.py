@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
 from experiments.reports.verdicts import CONFIDENCE
@@ -34,7 +35,7 @@ class Estimate(NamedTuple):
     high: float | None
 
 
-def mean_and_deviation(returns: Sequence[float]) -> tuple[float, float]:
+def mean_and_deviation(returns: ArrayLike) -> tuple[float, float]:
     """Mean and standard deviation of returns, all evaluations of all seeds together.
 
     This is the thesis's ±. For InvertedPendulum it prints overall deviations, such as 723 ± 364
@@ -42,7 +43,8 @@ def mean_and_deviation(returns: Sequence[float]) -> tuple[float, float]:
     deviation of three is at most √2 (M - mean), or √3 with n - 1 in place of n; and agents that
     end at 883 ± 17 have M near 900. What they do have is a learning curve, low at first.
     """
-    return float(np.mean(returns)), float(np.std(returns))
+    returns = np.asarray(returns, float)
+    return float(returns.mean()), float(returns.std())
 
 
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -155,9 +157,7 @@ def normalised(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [(np.asarray(group, float) - lowest) / (highest - lowest) for group in groups]
 
 
-def final(
-    env_steps: Sequence[int], returns: Sequence[float], total: int, planned: int
-) -> np.ndarray:
+def final(env_steps: ArrayLike, returns: ArrayLike, total: int, planned: int) -> np.ndarray:
     """The returns of a run's final evaluations: those in its last tenth, and the last one planned.
 
     A run that was cut before them has none.
@@ -178,13 +178,9 @@ def first_evaluations(planned: int) -> int:
     return max(1, math.ceil(FIRST_SHARE * planned))
 
 
-def jumpstart(
-    curves: Sequence[Sequence[float]], baseline: Sequence[Sequence[float]], count: int
-) -> float:
+def jumpstart(curves: ArrayLike, baseline: ArrayLike, count: int) -> float:
     """Mean return of the first `count` evaluations, less the baseline's; curves [N, E]."""
-    ours, base = (
-        np.mean([np.mean(curve[:count]) for curve in group]) for group in (curves, baseline)
-    )
+    ours, base = (np.asarray(group, float)[:, :count].mean() for group in (curves, baseline))
     return float(ours - base)
 
 
@@ -193,9 +189,7 @@ def threshold(first: float, final: float, share: float = REACHED_SHARE) -> float
     return first + share * (final - first)
 
 
-def time_to_threshold(
-    env_steps: Sequence[int], returns: Sequence[float], threshold: float
-) -> int | None:
+def time_to_threshold(env_steps: ArrayLike, returns: ArrayLike, threshold: float) -> int | None:
     """Environment steps at the first of E evaluations to reach a return; None if none does."""
-    reached = np.flatnonzero(np.asarray(returns) >= threshold)
-    return int(env_steps[reached[0]]) if len(reached) else None
+    reached = np.flatnonzero(np.asarray(returns, float) >= threshold)
+    return int(np.asarray(env_steps)[reached[0]]) if len(reached) else None

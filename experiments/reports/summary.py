@@ -86,7 +86,8 @@ def table(summaries: Sequence[Summary]) -> str:
         return "-" if statistics is None else f"{statistics[0]:.0f} ± {statistics[1]:.0f}"
 
     called = titles(summary.task for summary in summaries)
-    rows, notes = [], {}
+    rows: list[list[str]] = []
+    notes: dict[str, None] = {}
     for summary in summaries:
         name = summary.label + (f"  {called[summary.task]}" if len(called) > 1 else "")
         count = f"{summary.done}"
@@ -126,10 +127,10 @@ def _curves(run: Run, name: str | None = None) -> dict[str, list[Curve]]:
     """
     if not run.evaluations:
         raise ValueError(f"{run.folder} has no evaluations to draw yet")
-    groups, found = by_label(run), {}
+    groups = by_label(run)
     several = len(groups) > 1
+    found: dict[str, list[Curve]] = {task: [] for task in run.spec.tasks}
     for task in run.spec.tasks:
-        found[task] = []
         for label, members in groups.items():
             text = _called(members[0][0])
             text = text if name is None else _of_folder(name, text, several)
@@ -145,7 +146,7 @@ def _coloured(curves: Sequence[Curve], baseline: str | None = None) -> list[Curv
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, max(1, len(curves))))
     return [
         replace(
-            curve, style={"color": baseline if curve.style and baseline else shade} | curve.style
+            curve, style={"color": baseline if curve.style and baseline else shade, **curve.style}
         )
         for curve, shade in zip(curves, shades, strict=True)
     ]

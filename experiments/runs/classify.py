@@ -112,6 +112,7 @@ def classify(
     actors: Sequence[Source] = (),
     seed: int = 0,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     report: Report = unreported,
 ) -> Outcome:
     """Fits a classifier on samples of known tasks, and tests it on others of all tasks.
@@ -124,7 +125,7 @@ def classify(
       thresholds: ξ; by default the thesis's, scaled to the agent's M.
       neighbours: votes.
       quantile: share of known samples that the suggested threshold should hold.
-      features, policy, workers: see `latents.gather`.
+      features, policy, workers, timeout: see `latents.gather`.
       actors: with the policy "trained", one agent for each task; by default the source.
       seed: of episodes, draws and posterior samples.
       report: called after each phase; it counts those of all players.
@@ -142,8 +143,9 @@ def classify(
         actors=actors,
         policy=policy,
     )
-    players = [(actor, (task,)) for actor, task in zip(actors, tasks, strict=False)]
-    players = players or [(source, tasks)]
+    players: list[tuple[Source, tuple[str, ...]]] = [
+        (actor, (task,)) for actor, task in zip(actors, tasks, strict=False)
+    ] or [(source, tasks)]
     gathered: dict[str, Latents] = {}
     for number, (actor, played) in enumerate(players):
 
@@ -159,6 +161,7 @@ def classify(
             actor=actor,
             features=features,
             workers=workers,
+            timeout=timeout,
             report=of_all,
         )
         gathered |= dict(zip(played, found, strict=True))
@@ -242,7 +245,7 @@ def table(outcome: Outcome) -> str:
     header = ["threshold"]
     header += [f"{called[task]}, novel" for task in outcome.novel]
     header += [called[task] for task in outcome.known]
-    rows = []
+    rows: list[list[str]] = []
     for threshold, accuracies in zip(outcome.thresholds, outcome.accuracies, strict=True):
         suggested = len(rows) == len(outcome.thresholds) - 1
         row = [f"{threshold:.4g}" + (" (suggested)" if suggested else "")]
@@ -257,7 +260,8 @@ def table(outcome: Outcome) -> str:
 
 def distance_table(outcome: Outcome) -> str:
     """Distances to the nearest fitted sample, and what the neighbours took each task for."""
-    rows, called = [], titles(outcome.tasks)
+    rows: list[list[str]] = []
+    called = titles(outcome.tasks)
     for task in outcome.tasks:
         distances = outcome.distances[task]
         votes = ", ".join(f"{called[name]} {n}" for name, n in outcome.votes[task].most_common())

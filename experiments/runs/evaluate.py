@@ -14,7 +14,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.progress import Report, unreported
-from dreamer_jax.randomness import EVALUATION_PHASES
+from dreamer_jax.randomness import EVALUATION_PHASES, prediction_key
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import Episode, collect, episodes
 from dreamer_jax.video import tile, write_video
@@ -90,18 +90,25 @@ def evaluate(
     return rows
 
 
-def play(agents: Agents, number: int = 0, *, workers: int | None = None) -> Records:
+def play(
+    agents: Agents,
+    number: int = 0,
+    *,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+) -> Records:
     """One phase of every member on every task: the mode, without noise.
 
     Args:
       agents: the population.
       number: of the phase; each has starts of its own, those of `evaluate`'s episodes.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
 
     Returns:
       NumPy leaves [P, K, T, ...].
     """
-    env = make_env(agents.spec, workers)
+    env = make_env(agents.spec, workers, timeout)
     try:
         return _played(make_agent(agents.spec), env, agents, number)
     finally:
@@ -203,7 +210,7 @@ def prediction_frames(agent: Agent, params, batch: Records) -> np.ndarray:
     Returns:
       uint8 [L, 3 * size, about P * size, 3].
     """
-    keys = jax.random.split(jax.random.key(0), batch.reward.shape[0])
+    keys = jax.vmap(prediction_key)(jnp.arange(batch.reward.shape[0]))
     predict = jax.jit(
         jax.vmap(lambda params, batch, key: agent.predict(params, batch, CONTEXT, key))
     )

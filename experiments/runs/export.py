@@ -1,9 +1,11 @@
 """A member of a run -> an exported agent: weights and a card, see `experiments.runs.exported`."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+import envs
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.files import write_json_atomically
@@ -23,7 +25,9 @@ def export(
     member: int = 0,
     episodes: int = 10,
     note: str = "",
+    accept_failed: bool = False,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     report: Report = unreported,
 ) -> Card:
     """Writes one member of a run as weights and a card, after playing episodes with it.
@@ -34,12 +38,14 @@ def export(
       member: which of the population.
       episodes: to play of each task, for the card.
       note: a sentence for the card.
+      accept_failed: export a member that met losses that are not finite, as it was before.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
       report: called after each episode, with its mean return; it counts episodes.
 
     Raises:
       ValueError: the path ends otherwise; the folder holds no run, no checkpoint, no such member,
-        one that failed, or parameters that are not finite.
+        one that failed (unless that is accepted), or parameters that are not finite.
       FileExistsError: there is such a file already.
     """
     directory, path = Path(directory), Path(path)
@@ -50,12 +56,12 @@ def export(
             raise FileExistsError(f"{there} is there already: choose another name, or remove it")
     if episodes < 1:
         raise ValueError(f"a card needs episodes: {episodes} were asked for, must be at least 1")
-    source = load_source(directory, member)
+    source = load_source(directory, member, accept_failed=accept_failed)
     spec, params, chosen = source.spec, source.params, source.spec.members[member]
     for name, leaf in transfer.flatten(params).items():
         if not np.all(np.isfinite(leaf)):
             raise ValueError(f"{name} of member {member} of {directory} is not finite")
-    returns = _play(directory, member, episodes, workers=workers, report=report)
+    returns = _play(directory, member, episodes, workers=workers, timeout=timeout, report=report)
     counters = Checkpointer(directory / "checkpoints").metadata()["counters"]
     schedule = Schedule(spec.config.schedule, len(spec.tasks))
     steps = schedule.environment_steps(counters["rounds"])
@@ -80,9 +86,9 @@ def export(
     return card
 
 
-def _play(directory, member: int, episodes: int, *, workers, report) -> dict[str, tuple]:
-    """Returns of episodes of one member, by name of the task."""
-    rows = evaluate(load_agents(directory), episodes, workers=workers, report=report)
+def _play(directory: Path, member: int, episodes: int, **options: Any) -> dict[str, tuple]:
+    """Returns of episodes of one member, by name of the task; options are those of `evaluate`."""
+    rows = evaluate(load_agents(directory), episodes, **options)
     returns: dict[str, tuple[float, ...]] = {}
     for row in rows:
         if row["member"] == member:

@@ -19,7 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.progress import Report, unreported
-from dreamer_jax.randomness import LATENT_PHASES, latent_key
+from dreamer_jax.randomness import LATENT_PHASES, choice_generator, latent_key
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
 from dreamer_jax.waiting import to_host
@@ -47,7 +47,7 @@ class Latents(NamedTuple):
 
     def draw(self, samples: int, seed: int) -> "Latents":
         """S of them at random, each at most once."""
-        chosen = np.random.default_rng(seed).permutation(len(self.episodes))[:samples]
+        chosen = choice_generator(seed).permutation(len(self.episodes))[:samples]
         return Latents(self.features[chosen], self.episodes[chosen])
 
 
@@ -88,6 +88,7 @@ def gather(
     actor: Source | None = None,
     features: Features = "sample",
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     report: Report = unreported,
 ) -> list[Latents]:
     """Plays phases of K tasks and infers the latent states of all their records.
@@ -101,6 +102,7 @@ def gather(
       actor: the trained agent that acts; by default the source.
       features: see `infer`.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
       report: called after each phase; it counts phases.
 
     Returns:
@@ -117,6 +119,7 @@ def gather(
         image_size=source.spec.config.network.image_size,
         action_repeat=source.spec.config.schedule.action_repeat,
         workers=workers,
+        timeout=timeout,
         action_size=acting.action_size,
         supersample=source.spec.config.schedule.supersample,
     )
@@ -152,9 +155,16 @@ def gather(
     return [Latents(*(np.concatenate(x) for x in zip(*parts, strict=True))) for parts in found]
 
 
-def own_latents(source: Source, samples: int, *, workers: int | None = None) -> list[Latents]:
+def own_latents(
+    source: Source,
+    samples: int,
+    *,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+) -> list[Latents]:
     """At least so many latent states of an agent on each of its own tasks, by random actions."""
-    return gather(source, source.spec.tasks, phases_for(source, samples), workers=workers)
+    phases = phases_for(source, samples)
+    return gather(source, source.spec.tasks, phases, workers=workers, timeout=timeout)
 
 
 def _check_sizes(

@@ -29,8 +29,8 @@ from experiments.runs.start import load_sources, transferred_members
 
 
 def _versions() -> dict[str, str]:
-    names = ("jax", "jaxlib", "flax", "optax", "numpy", "pillow")
-    names += ("gymnasium", "pygame", "pybullet", "brax", "mujoco")
+    names = ["jax", "jaxlib", "flax", "optax", "numpy", "pillow"]
+    names += ["gymnasium", "pygame", "pybullet", "brax", "mujoco"]
     versions = {"python": platform.python_version(), "backend": jax.default_backend()}
     for name in names:
         try:
@@ -99,7 +99,7 @@ def make_run(
         state, report = None, None
         if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
             sources = load_sources(spec, base, accept_failed=accept_failed)
-            state, report = transferred_members(spec, sources, workers=workers)
+            state, report = transferred_members(spec, sources, workers=workers, timeout=timeout)
         agent = make_agent(spec)
         env = make_env(spec, workers=workers, timeout=timeout)
         # What cannot be had is refused before the folder is made.

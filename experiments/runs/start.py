@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+import envs
 import transfer
 from dreamer_jax.learning import AgentState
 from experiments.methods import Sources
@@ -41,7 +42,11 @@ def load_sources(spec: RunSpec, base: str | Path = "", *, accept_failed: bool = 
 
 
 def transferred_members(
-    spec: RunSpec, sources: Sources, *, workers: int | None = None
+    spec: RunSpec,
+    sources: Sources,
+    *,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
 ) -> tuple[AgentState, transfer.Report]:
     """Fresh agents for all members, the targets among them after the run's method.
 
@@ -49,6 +54,7 @@ def transferred_members(
       spec: of the run.
       sources: from `load_sources`.
       workers: simulator processes for latent states that a method asks for.
+      timeout: seconds after which a simulator that does not answer is given up.
 
     Returns:
       The state, leaves [P, ...], and the report of what happened to each leaf.
@@ -57,7 +63,7 @@ def transferred_members(
       ValueError: the sources do not fit what the method reads.
     """
     agent, method = make_agent(spec), spec.method
-    sample = functools.partial(own_latents, workers=workers)
+    sample = functools.partial(own_latents, workers=workers, timeout=timeout)
     given = method.knowledge(agent, spec.seeds, sources, sample)
     # Members from scratch come last.
     count = len(method.targets(spec.seeds))

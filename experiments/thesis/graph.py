@@ -1,6 +1,6 @@
 """The graph of runs behind cells of the grid: what is done, what is missing, and in which order."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -43,22 +43,48 @@ class PlannedRun:
     Attributes:
       name: of its folder under the root of results.
       cells: names of its cells, in the order of its members.
-      spec: what it is; its sources are named by their runs. None if its folder is damaged.
+      spec: what it is; its sources are named by their runs.
       needs: names of the runs that must be done before it can begin; none once it has begun.
-      state: "missing", "cut" (begun, and can be resumed), "done", or "corrupt".
+      state: "missing", "cut" (begun, and can be resumed) or "done".
       progress: share of its updates that is done.
-      problem: what is wrong with a corrupt one.
       failed: names of the cells whose agents met losses that are not finite.
     """
 
     name: str
     cells: tuple[str, ...]
-    spec: RunSpec | None
+    spec: RunSpec
     needs: tuple[str, ...] = ()
-    state: Literal["missing", "cut", "done", "corrupt"] = "missing"
+    state: Literal["missing", "cut", "done"] = "missing"
     progress: float = 0.0
-    problem: str = ""
     failed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DamagedRun:
+    """A run of the graph whose folder cannot be read.
+
+    Attributes:
+      name: of its folder under the root of results.
+      cells: names of its cells; none if the folder does not even say that.
+      problem: what is wrong with it.
+      needs: none; what it began from is not known.
+      state: "corrupt".
+    """
+
+    name: str
+    cells: tuple[str, ...]
+    problem: str
+    needs: tuple[()] = ()
+    state: Literal["corrupt"] = "corrupt"
+
+
+Graph = Sequence[PlannedRun | DamagedRun]
+"""Runs, each after those that it needs."""
+
+
+def due(runs: Graph) -> list[PlannedRun]:
+    """The runs that still take time: those that are missing or were cut."""
+    return [run for run in runs if isinstance(run, PlannedRun) and run.state != "done"]
 
 
 def changed_settings(root: str | Path) -> tuple[Difference, ...]:
@@ -94,7 +120,7 @@ def plan_runs(
     config: Config,
     root: str | Path,
     reserved: Mapping[str, PlannedRun] = MappingProxyType({}),
-) -> tuple[PlannedRun, ...]:
+) -> Graph:
     """The runs behind cells, each after those that it needs, and those that were cut first.
 
     Cells that are done, or whose run has begun, need no source any more: nothing is repeated, and
@@ -111,7 +137,7 @@ def plan_runs(
     """
     cells, root = tuple(cells), Path(root)
     held, found = _places(root)
-    used: dict[str, PlannedRun] = {run.name: run for run in found.values() if not run.cells}
+    used = {run.name: run for run in found.values() if not run.cells}
     missing: dict[Cell, None] = {}
     begun_names = {name for name, _ in held.values()} | set(found)
     for run in reserved.values():
@@ -120,7 +146,7 @@ def plan_runs(
             for member, cell_name in enumerate(run.cells):
                 held.setdefault(cell_name, (run.name, member))
 
-    def use(name: str) -> PlannedRun:
+    def use(name: str) -> PlannedRun | DamagedRun:
         if name not in found:
             found[name] = inspect_run(root / name)
         if name not in used:
@@ -160,12 +186,12 @@ def _planned(new: Population) -> PlannedRun:
     )
 
 
-def _in_order(runs: list[PlannedRun]) -> tuple[PlannedRun, ...]:
+def _in_order(runs: Graph) -> Graph:
     """The runs as they are given, but each after those that it needs."""
     by_name = {run.name: run for run in runs}
-    ordered: dict[str, PlannedRun] = {}
+    ordered: dict[str, PlannedRun | DamagedRun] = {}
 
-    def visit(run: PlannedRun) -> None:
+    def visit(run: PlannedRun | DamagedRun) -> None:
         for name in run.needs:
             if name in by_name and name not in ordered:
                 visit(by_name[name])
@@ -186,26 +212,24 @@ def _taken_names(root: Path) -> set[str]:
     return {path.name for path in root.iterdir() if begun(path) or not (path / CELLS).exists()}
 
 
-def _places(root: Path) -> tuple[dict[str, tuple[str, int]], dict[str, PlannedRun]]:
+def _places(
+    root: Path,
+) -> tuple[dict[str, tuple[str, int]], dict[str, PlannedRun | DamagedRun]]:
     """Where each cell is, name -> (run, member), and the runs that do not say what they hold."""
     held: dict[str, tuple[str, int]] = {}
-    damaged: dict[str, PlannedRun] = {}
+    damaged: dict[str, PlannedRun | DamagedRun] = {}
     for folder in run_folders(root):
         try:
             names = read_cells(folder)
         except ValueError as error:
-            damaged[folder.name] = _corrupt(folder, (), error)
+            damaged[folder.name] = DamagedRun(folder.name, (), str(error))
             continue
         for member, name in enumerate(names):
             held.setdefault(name, (folder.name, member))
     return held, damaged
 
 
-def _corrupt(folder: Path, cells: tuple[str, ...], error: Exception) -> PlannedRun:
-    return PlannedRun(folder.name, cells, None, state="corrupt", problem=str(error))
-
-
-def inspect_run(folder: Path) -> PlannedRun:
+def inspect_run(folder: Path) -> PlannedRun | DamagedRun:
     """A run that has begun, as its folder tells."""
     cells: tuple[str, ...] = ()
     try:
@@ -217,7 +241,7 @@ def inspect_run(folder: Path) -> PlannedRun:
         evaluations = _evaluations(folder)
         failed = tuple(cells[member] for member in sorted(failed_members(folder)))
         checkpoints = Checkpointer(folder / "checkpoints")
-        if checkpoints.latest() is None:
+        if (latest := checkpoints.latest()) is None:
             # Copied without checkpoints: what is evaluated to the end is done, for tables.
             done = evaluations >= schedule.evaluations
             needs = () if done else spec.method.needs
@@ -230,9 +254,9 @@ def inspect_run(folder: Path) -> PlannedRun:
                 float(done),
                 failed=failed,
             )
-        counters = Counters(**checkpoints.metadata(checkpoints.latest())["counters"])
+        counters = Counters(**checkpoints.metadata(latest)["counters"])
     except _UNREADABLE as error:
-        return _corrupt(folder, cells, error)
+        return DamagedRun(folder.name, cells, str(error))
     done = schedule.next(counters) == "done"
     progress = counters.updates / max(1, schedule.updates)
     return PlannedRun(
@@ -248,8 +272,8 @@ def _evaluations(folder: Path) -> int:
     return len({row["env_steps"] for row in rows})
 
 
-def _check_settings(folder: Path, run: PlannedRun, config: Config) -> None:
-    if run.spec is None:
+def _check_settings(folder: Path, run: PlannedRun | DamagedRun, config: Config) -> None:
+    if isinstance(run, DamagedRun):
         return
     if different := _of_results(run.spec.config, config):
         told = "; ".join(map(str, different))

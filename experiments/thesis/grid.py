@@ -8,7 +8,7 @@ the whole is a graph in which each agent occurs once, whoever asks for it.
 import dataclasses
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 from experiments import methods
 
@@ -33,8 +33,6 @@ SEEDS = (0, 1, 2)
 """Seeds of targets and baselines; a source agent is a single run, of the first of them."""
 THRESHOLDS = (50.0, 70.0, 90.0)
 """Thresholds ξ of latent task classification, for M = 230 latent features."""
-COMPARED = ("fine-tuning", "frozen-source")
-"""Methods that are not the thesis's and may be shown beside its own."""
 AUTOENCODER = ("Hopper", "Ant")
 """The tasks of the agent whose autoencoder is the universal one (section 4.3.1)."""
 
@@ -80,16 +78,15 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table:
-    """What a table of the thesis shows.
+class ReturnsTable:
+    """What a table of returns shows.
 
     Attributes:
       name: such as "table-3".
-      kind: "ftl" (fractional transfer to one target), "meta" (reward meta-models for all targets)
-        or "ltc" (latent task classification).
-      targets: titles of the target tasks; for "ltc" the novel ones.
-      metric: of the returns, see section 4.2.3; None for "ltc".
-      known: for "ltc", titles of the known tasks.
+      kind: "ftl" (fractional transfer to one target) or "meta" (reward meta-models for all
+        targets).
+      targets: titles of the target tasks.
+      metric: of the returns, see section 4.2.3.
       counts: numbers of source tasks.
       omegas: fractions.
       backend: the simulator.
@@ -98,14 +95,38 @@ class Table:
     """
 
     name: str
-    kind: Literal["ftl", "meta", "ltc"]
+    kind: Literal["ftl", "meta"]
     targets: tuple[str, ...]
-    metric: Metric | None = None
-    known: tuple[str, ...] = ()
+    metric: Metric
     counts: tuple[int, ...] = COUNTS
     omegas: tuple[float, ...] = OMEGAS
     backend: Backend = "bullet"
     compared: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LatentTable:
+    """What a table of latent task classification shows.
+
+    Attributes:
+      name: such as "table-13".
+      novel: titles of the tasks that the classifier has not seen.
+      known: titles of those that it was fitted on.
+      backend: the simulator.
+    """
+
+    name: str
+    novel: tuple[str, ...]
+    known: tuple[str, ...]
+    backend: Backend = "bullet"
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """All of them, in the order of the columns."""
+        return (*self.novel, *self.known)
+
+
+Table = ReturnsTable | LatentTable
 
 
 @dataclass(frozen=True)
@@ -158,24 +179,19 @@ _META_TARGETS = (
     "Ant",
 )
 
-TABLES = {
-    table.name: table
-    for table in (
-        *(
-            Table(f"table-{2 * i + j + 1}", "ftl", (target,), metric)
-            for i, target in enumerate(TASKS)
-            for j, metric in enumerate(_METRICS)
-        ),
-        *(
-            Table(f"table-{13 + i}", "ltc", novel, known=known)
-            for i, (novel, known) in enumerate(_SPLITS)
-        ),
-        *(
-            Table(f"table-{16 + i}", "meta", _META_TARGETS, metric)
-            for i, metric in enumerate(_METRICS)
-        ),
-    )
-}
+_TABLES: tuple[Table, ...] = (
+    *(
+        ReturnsTable(f"table-{2 * i + j + 1}", "ftl", (target,), metric)
+        for i, target in enumerate(TASKS)
+        for j, metric in enumerate(_METRICS)
+    ),
+    *(LatentTable(f"table-{13 + i}", novel, known) for i, (novel, known) in enumerate(_SPLITS)),
+    *(
+        ReturnsTable(f"table-{16 + i}", "meta", _META_TARGETS, metric)
+        for i, metric in enumerate(_METRICS)
+    ),
+)
+TABLES = {table.name: table for table in _TABLES}
 """Tables 1 to 17 by name."""
 
 FIGURES = {
@@ -209,7 +225,9 @@ def multitask(backend: Backend, tasks: Iterable[str], seed: int) -> Cell:
     return Cell(backend, tuple(task for task in TASKS if task in tasks), "scratch", seed)
 
 
-def fractional(backend: Backend, target: str, count: int, omega: float, seed: int, source: int):
+def fractional(
+    backend: Backend, target: str, count: int, omega: float, seed: int, source: int
+) -> Cell:
     """A target of fractional transfer from `count` tasks; `source` is the source agent's seed."""
     agent = multitask(backend, SOURCES[target][:count], source)
     return Cell(backend, (target,), "fractional", seed, agent, omega)
@@ -235,6 +253,9 @@ def compared(
     return Cell(backend, (target,), method, seed, agent)
 
 
+Shown = TypeVar("Shown", bound=ReturnsTable | LatentTable | Figure)
+"""A table or figure."""
+
 # --- what is shown --------------------------------------------------------------------------------
 
 Key = tuple[str, int | None, float | str | None]
@@ -242,7 +263,7 @@ Key = tuple[str, int | None, float | str | None]
 the fraction, or the name of the method where it is not the table's own."""
 
 
-def entries(table: Table, seeds: Sequence[int] = SEEDS) -> dict[Key, tuple[Cell, ...]]:
+def entries(table: ReturnsTable, seeds: Sequence[int] = SEEDS) -> dict[Key, tuple[Cell, ...]]:
     """The cells of each entry of a table of returns, one per seed; a target's baseline first."""
     backend, source = table.backend, seeds[0]
     found: dict[Key, tuple[Cell, ...]] = {}
@@ -313,9 +334,9 @@ def shown(entry: Table | Figure, seeds: Sequence[int] = SEEDS) -> tuple[Cell, ..
 
     A table of latent task classification shows samples of one agent; figures of the tasks none.
     """
-    if entry.kind == "ltc":
+    if isinstance(entry, LatentTable):
         return (multitask(entry.backend, AUTOENCODER, seeds[0]),)
-    if isinstance(entry, Table):
+    if isinstance(entry, ReturnsTable):
         groups = list(entries(entry, seeds).values())
     else:
         groups = [cells for lines in panels(entry, seeds).values() for cells in lines]
@@ -324,9 +345,30 @@ def shown(entry: Table | Figure, seeds: Sequence[int] = SEEDS) -> tuple[Cell, ..
     return tuple(sorted(cells, key=lambda cell: cell.source is None and len(cell.tasks) == 1))
 
 
-def with_compared(
-    entry: Table | Figure, held: Container[str], seeds: Sequence[int] = SEEDS
-) -> Table | Figure:
+def may_be_compared() -> tuple[str, ...]:
+    """Names of the methods that tables of fractional transfer may show beside their own."""
+    return tuple(name for name, method in methods.known().items() if method.COMPARED)
+
+
+def beside(entry: Shown, compared: tuple[str, ...]) -> Shown:
+    """A table of fractional transfer with rows of other methods; anything else as it is."""
+    if isinstance(entry, ReturnsTable) and entry.kind == "ftl":
+        return dataclasses.replace(entry, compared=compared)
+    return entry
+
+
+def restricted(entry: Shown, omegas: Container[float], counts: Container[int]) -> Shown:
+    """A table or figure of some fractions and numbers of source tasks only."""
+    if isinstance(entry, LatentTable):
+        return entry
+    return dataclasses.replace(
+        entry,
+        omegas=tuple(omega for omega in entry.omegas if omega in omegas),
+        counts=tuple(count for count in entry.counts if count in counts),
+    )
+
+
+def with_compared(entry: Shown, held: Container[str], seeds: Sequence[int] = SEEDS) -> Shown:
     """A table with the rows of all methods of comparison of which there are cells.
 
     Args:
@@ -334,21 +376,15 @@ def with_compared(
       held: names of the cells that are there.
       seeds: see `entries`.
     """
-    if entry.kind != "ftl" or isinstance(entry, Figure):
+    if not isinstance(entry, ReturnsTable):
         return entry
-    whole = dataclasses.replace(entry, compared=COMPARED)
-    there = [
-        method
-        for method in COMPARED
-        if method in entry.compared
-        or any(
-            cell.name in held
-            for (_, _, variant), cells in entries(whole, seeds).items()
-            if variant == method
-            for cell in cells
-        )
-    ]
-    return dataclasses.replace(entry, compared=tuple(there))
+    whole = beside(entry, may_be_compared())
+    there = {
+        variant
+        for (_, _, variant), cells in entries(whole, seeds).items()
+        if any(cell.name in held for cell in cells)
+    }
+    return beside(entry, tuple(x for x in whole.compared if x in there or x in entry.compared))
 
 
 def closure(cells: Iterable[Cell]) -> tuple[Cell, ...]:
@@ -365,6 +401,6 @@ def closure(cells: Iterable[Cell]) -> tuple[Cell, ...]:
     return tuple(ordered)
 
 
-def on_backend(entry: Table | Figure, backend: Backend) -> Table | Figure:
+def on_backend(entry: Shown, backend: Backend) -> Shown:
     """The same table or figure on another simulator."""
     return dataclasses.replace(entry, backend=backend)

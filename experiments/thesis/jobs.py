@@ -17,6 +17,7 @@ from typing import Literal
 
 import jax
 
+import envs
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.host_memory import keep_freed_memory
@@ -27,7 +28,7 @@ from envs import SimulatorError
 from experiments.runs.folder import CELLS, begun, set_aside
 from experiments.runs.run import carry_out, make_run
 from experiments.thesis.estimate import in_memory
-from experiments.thesis.graph import PlannedRun, inspect_run
+from experiments.thesis.graph import DamagedRun, PlannedRun, inspect_run
 from experiments.thesis.reservations import at_work, claim, forget, reserved
 from experiments.thesis.speeds import cache_folder
 
@@ -47,12 +48,14 @@ class Job:
       name: of the run.
       workers: simulator processes; by default one per core.
       accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
     """
 
     root: Path
     name: str
     workers: int | None = None
     accept_failed: bool = False
+    timeout: float = envs.SIMULATOR_TIMEOUT
 
 
 @dataclass(frozen=True)
@@ -75,15 +78,26 @@ class Ending:
 
 
 def train(
-    run: PlannedRun, root: Path, workers: int | None, accept_failed: bool = False
+    run: PlannedRun,
+    root: Path,
+    workers: int | None,
+    *,
+    accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
+
+    Args:
+      run: which one.
+      root: the folder of all results.
+      workers: simulator processes; by default one per core.
+      accept_failed: transfer from agents that failed, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
       SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
     """
-    assert run.spec is not None  # only what is damaged has none
     folder, spec = root / run.name, run.spec
     lock = FolderLock(folder)
     if not begun(folder):
@@ -92,18 +106,18 @@ def train(
         write_json_atomically(folder / CELLS, list(run.cells))
         spec = in_memory(spec)
     try:
-        return carry_out(
-            make_run(
-                spec,
-                folder,
-                resume=True,
-                workers=workers,
-                base=root,
-                accept_failed=accept_failed,
-                lock=lock,
-                cells=run.cells,
-            )
+        begins = make_run(
+            spec,
+            folder,
+            resume=True,
+            workers=workers,
+            base=root,
+            accept_failed=accept_failed,
+            timeout=timeout,
+            lock=lock,
+            cells=run.cells,
         )
+        return carry_out(begins)
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
@@ -146,7 +160,7 @@ def perform_elsewhere(job: Job) -> Ending:
     """Performs a job for an engine in a process of its own: waits for others who train its run,
     and tells whatever happens, with the trace in the process's own log."""
     keep_freed_memory()
-    if jax.config.jax_compilation_cache_dir is None:  # as the command line says it
+    if jax.config.values["jax_compilation_cache_dir"] is None:  # as the command line says it
         jax.config.update("jax_compilation_cache_dir", str(cache_folder().with_name("jax")))
     try:
         return perform(job, wait=True)
@@ -173,16 +187,15 @@ def _claimed(root: Path, name: str) -> Iterator[None]:
         raise _BusyError(f"{name} is trained by {error.holder}") from None
 
 
-def set_aside_damaged(job: Job) -> Ending | None:
+def set_aside_damaged(root: Path, name: str) -> Ending | None:
     """Sets aside the folder of a run that was found to be damaged, if it is and nobody trains it.
 
     Returns:
       How the run failed; none if it did not.
     """
-    root = Path(job.root)
-    with contextlib.suppress(FolderInUseError), at_work(root), claim(root, job.name):
-        if (root / job.name).exists() and (run := inspect_run(root / job.name)).state == "corrupt":
-            return Ending(job.name, "failed", _aside(root, job.name, run.problem))
+    with contextlib.suppress(FolderInUseError), at_work(root), claim(root, name):
+        if (root / name).exists() and isinstance(run := inspect_run(root / name), DamagedRun):
+            return Ending(name, "failed", _aside(root, name, run.problem))
     return None
 
 
@@ -198,7 +211,7 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
     if run is None:
         told = "it is planned no more: the same command plans it anew"
         return Ending(name, "failed", told)
-    if run.state == "corrupt":
+    if isinstance(run, DamagedRun):
         return Ending(name, "failed", _aside(root, name, run.problem))
     if run.state == "done":
         return Ending(name, "there")
@@ -208,7 +221,7 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
         return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
     begins(run)
     if train is None:
-        train = functools.partial(_train, accept_failed=job.accept_failed)
+        train = functools.partial(_train, accept_failed=job.accept_failed, timeout=job.timeout)
     try:
         kind = train(run, root, job.workers)
     except FolderInUseError:

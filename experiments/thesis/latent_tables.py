@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
+import envs
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.progress import Report, unreported
 from experiments.runs import classify
-from experiments.runs.agents import load_source
+from experiments.runs.agents import Source, load_source
 from experiments.runs.folder import folders, latents_folder
 from experiments.runs.latents import Latents, gather
-from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, Table, multitask
+from experiments.thesis.grid import AUTOENCODER, TASKS, Backend, LatentTable, multitask
 from experiments.thesis.populations import task_name
 
 SAMPLES = 100
@@ -32,10 +33,11 @@ Drawn = Mapping[str, tuple[Latents, Latents]]
 
 def make_table(
     root: str | Path,
-    table: Table,
+    table: LatentTable,
     seed: int,
     *,
     workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     accept_failed: bool = False,
     say: Callable[[str], Any] = print,
     report: Report = unreported,
@@ -44,9 +46,10 @@ def make_table(
 
     Args:
       root: the folder of all results.
-      table: of the kind "ltc".
+      table: which one.
       seed: of the agent, and of episodes and samples.
       workers: simulator processes; by default one per core.
+      timeout: seconds after which a simulator that does not answer is given up.
       accept_failed: take an agent whose losses were not finite any more, as it was before.
       say: where messages go.
       report: called after each round of gathering; it counts them.
@@ -64,12 +67,23 @@ def make_table(
     names = {title: task_name(table.backend, title) for title in TASKS}
     if not (folder / "samples.npz").exists():
         say(f"latent states of {len(names)} tasks: {folder}")
-        drawn = _gather(
-            root, table.backend, tuple(names.values()), seed, workers, accept_failed, report
+        source = _agent(root, table.backend, seed, accept_failed)
+        found = gather(
+            source,
+            tuple(names.values()),
+            classify.rounds(source, SAMPLES),
+            seed=seed,
+            workers=workers,
+            timeout=timeout,
+            report=report,
         )
+        drawn = {
+            task: classify.draw(latents, SAMPLES, seed)
+            for task, latents in zip(names.values(), found, strict=True)
+        }
         _write(folder / "samples.npz", drawn)
     drawn = _read(folder / "samples.npz", tuple(names.values()))
-    tasks = tuple(names[title] for title in (*table.targets, *table.known))
+    tasks = tuple(names[title] for title in table.tasks)
     outcome = classify.judge(tasks, tuple(names[title] for title in table.known), drawn)
     classify.plot(outcome, folder / table.name)
     size = next(iter(drawn.values()))[0].features.shape[1]
@@ -78,26 +92,13 @@ def make_table(
     return path
 
 
-def _gather(
-    root: str | Path,
-    backend: Backend,
-    tasks: tuple[str, ...],
-    seed: int,
-    workers: int | None,
-    accept_failed: bool,
-    report: Report,
-) -> dict[str, tuple[Latents, Latents]]:
+def _agent(root: str | Path, backend: Backend, seed: int, accept_failed: bool) -> Source:
+    """The agent whose latent states are classified."""
     cell = multitask(backend, AUTOENCODER, seed)
     places = folders(root)
     if cell.name not in places:
         raise ValueError(f"the agent {cell.name!r} is not trained yet: its table trains it first")
-    source = load_source(*places[cell.name], accept_failed=accept_failed)
-    rounds = classify.rounds(source, SAMPLES)
-    found = gather(source, tasks, rounds, seed=seed, workers=workers, report=report)
-    return {
-        task: classify.draw(latents, SAMPLES, seed)
-        for task, latents in zip(tasks, found, strict=True)
-    }
+    return load_source(*places[cell.name], accept_failed=accept_failed)
 
 
 def _write(path: Path, drawn: Drawn) -> None:
@@ -118,13 +119,11 @@ def _write(path: Path, drawn: Drawn) -> None:
 def _read(path: Path, tasks: tuple[str, ...]) -> dict[str, tuple[Latents, Latents]]:
     try:
         with np.load(path) as arrays:
-            return {
-                task: tuple(
-                    Latents(*(arrays[f"{task}/{half}/{name}"] for name in Latents._fields))
-                    for half in ("fitted", "tested")
-                )
-                for task in tasks
-            }
+
+            def half(task: str, name: str) -> Latents:
+                return Latents(*(arrays[f"{task}/{name}/{field}"] for field in Latents._fields))
+
+            return {task: (half(task, "fitted"), half(task, "tested")) for task in tasks}
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path} is damaged ({error}): delete it, and its samples are gathered again"

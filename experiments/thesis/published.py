@@ -82,13 +82,13 @@ def _index() -> dict[tuple, Published]:
 
 
 def returns(
-    table: int, target: str, sources: int | None = None, omega: float | None = None
+    table: int, target: str, sources: int | None = None, variant: float | str | None = None
 ) -> Published | None:
     """The entry of tables 1 to 12, 16 or 17 with these keys; the baseline without `sources`.
 
-    None if the table has no such entry, such as a fraction that the thesis did not try.
+    None if the table has no such entry, such as a fraction or a method that the thesis did not try.
     """
-    return _index().get((table, target, sources, omega))
+    return _index().get((table, target, sources, variant))
 
 
 def classification(table: int, task: str, threshold: float) -> Published | None:

@@ -18,7 +18,7 @@ from dreamer_jax.config import Config
 from dreamer_jax.integrity import DamagedError, read_sealed_json, write_sealed_json
 from dreamer_jax.locks import FolderInUseError, FolderLock, Presence
 from experiments.runs.spec import RunSpec
-from experiments.thesis.graph import PlannedRun, plan_runs
+from experiments.thesis.graph import Graph, PlannedRun, plan_runs
 from experiments.thesis.grid import Cell
 
 WORK = ".work"
@@ -28,9 +28,7 @@ _PRESENCE, _PLANNING, _PLAN = "presence", "planning", ".json"
 
 
 @contextlib.contextmanager
-def planned(
-    cells: Iterable[Cell], config: Config, root: str | Path
-) -> Iterator[tuple[PlannedRun, ...]]:
+def planned(cells: Iterable[Cell], config: Config, root: str | Path) -> Iterator[Graph]:
     """Plans the runs behind cells, beside what others plan there, and is at work until its end.
 
     Nothing is written if nothing is left to do.
@@ -60,7 +58,7 @@ def planned(
             # First what is planned, then what is there: a run that begins meanwhile is in one.
             runs = plan_runs(cells, config, root, reservations(root))
             for run in runs:
-                if run.state == "missing":
+                if isinstance(run, PlannedRun) and run.state == "missing":
                     _reserve(run, root)
         yield runs
 
@@ -123,7 +121,6 @@ def _read(path: Path) -> PlannedRun:
 
 
 def _reserve(run: PlannedRun, root: Path) -> None:
-    assert run.spec is not None  # only what is damaged has none
     path = _path(root, run.name)
     if not path.exists():
         values = {"spec": run.spec.to_dict(), "needs": run.needs, "cells": run.cells}

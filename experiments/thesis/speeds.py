@@ -19,9 +19,10 @@ from dreamer_jax import config as configs
 from dreamer_jax.config import Config
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.progress import Report, unreported
+from envs import SIMULATOR_TIMEOUT
 from envs.pool import available_cores
 from experiments.runs.spec import RunSpec
-from experiments.thesis.estimate import Speed, measure
+from experiments.thesis.measurement import Speed, measure
 
 # Of the schedule, what a tick takes; the rest says how many there are.
 _OF_TICKS = ("action_repeat", "supersample", "phase_environment_steps")
@@ -52,6 +53,7 @@ def speed_of(
     folder: Path,
     *,
     again: bool = False,
+    timeout: float = SIMULATOR_TIMEOUT,
     report: Report = unreported,
 ) -> Known:
     """How fast this machine is at runs of one preset.
@@ -63,6 +65,7 @@ def speed_of(
       specs: the runs.
       folder: where measurements are kept.
       again: measures in any case.
+      timeout: seconds after which a simulator that does not answer is given up.
       report: called before each measurement with what it is of.
     """
     path = folder / f"{_key(specs[0].config)}.json"
@@ -70,7 +73,7 @@ def speed_of(
     tasks = {task for spec in specs for task in spec.tasks}
     if before is not None and not again and tasks <= set(before.tick_seconds):
         return Known(before, path, kept=True)
-    found = measure(specs, report)
+    found = measure(specs, report, timeout=timeout)
     if before is not None:
         found = dataclasses.replace(
             found,

@@ -1,15 +1,15 @@
 """Carries out planned runs on an engine: what was cut goes on, what fails is named, the rest goes
 on. Those that need what failed are left for the next time."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import envs
 from experiments.runs.folder import folders
 from experiments.thesis.engines import Engine, Resources, Task
 from experiments.thesis.engines.local import in_turn, one_by_one
-from experiments.thesis.estimate import DUE
-from experiments.thesis.graph import PlannedRun, inspect_run
+from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due, inspect_run
 from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, Train, set_aside_damaged
 from experiments.thesis.reservations import at_work, reservations
 
@@ -57,12 +57,13 @@ class Progress:
 
 
 def carry_out_runs(
-    runs: Sequence[PlannedRun],
+    runs: Graph,
     root: str | Path,
     *,
     engine: Engine = one_by_one,
     workers: int | None = None,
     accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     resources: Callable[[PlannedRun], Resources] = lambda run: Resources(),
     say: Say = print,
 ) -> Progress:
@@ -74,28 +75,26 @@ def carry_out_runs(
       engine: where they are trained; by default here, in the order given.
       workers: simulator processes; by default one per core.
       accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
       resources: what a run gets.
       say: where messages go.
     """
     root, progress = Path(root).absolute(), Progress()
 
-    def job(run: PlannedRun) -> Job:
-        return Job(root, run.name, workers, accept_failed)
-
     for run in runs:
-        if run.state == "corrupt" and (ending := set_aside_damaged(job(run))):
+        if isinstance(run, DamagedRun) and (ending := set_aside_damaged(root, run.name)):
             progress.add(ending)
-    due = [run for run in runs if run.state in DUE]
-    names = {run.name for run in due}
+    left = due(runs)
+    names = {run.name for run in left}
     tasks = [
         Task(
-            job(run),
+            Job(root, run.name, workers, accept_failed, timeout),
             run,
             tuple(name for name in run.needs if name in names),
             resources(run),
-            f"run {number} of {len(due)}, {run.name}",
+            f"run {number} of {len(left)}, {run.name}",
         )
-        for number, run in enumerate(due, start=1)
+        for number, run in enumerate(left, start=1)
     ]
     for ending in engine(tasks, say):
         progress.add(ending)
@@ -107,6 +106,7 @@ def work(
     *,
     workers: int | None = None,
     accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
     train: Train | None = None,
     say: Say = print,
     poll: float = POLL_SECONDS,
@@ -118,22 +118,24 @@ def work(
       root: the folder of all results.
       workers: simulator processes; by default one per core.
       accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
       train: what trains one run.
       say: where messages go.
       poll: seconds between looks at what others do.
     """
     root, progress = Path(root).absolute(), Progress()
 
-    def due() -> Iterator[Task]:
+    def tasks() -> list[Task]:
         planned = reservations(root)
         # Of copies that hold the same agents, that which plans take.
         names = {folder for folder, _ in folders(root).values()}
         runs = {folder.name: inspect_run(folder) for folder in sorted(names)}
-        for run in {**planned, **runs}.values():
-            if run.state in DUE:
-                yield Task(Job(root, run.name, workers, accept_failed), run, run.needs)
+        return [
+            Task(Job(root, run.name, workers, accept_failed, timeout), run, run.needs)
+            for run in due(list({**planned, **runs}.values()))
+        ]
 
     with at_work(root):
-        for ending in in_turn(lambda: list(due()), say, train=train, poll=poll):
+        for ending in in_turn(tasks, say, train=train, poll=poll):
             progress.add(ending)
     return progress

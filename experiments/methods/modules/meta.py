@@ -120,7 +120,7 @@ class MetaDynamics(rssm.Dynamics, kw_only=True):
         usual = self._usual()
 
         def predict(params, inputs):
-            return usual.apply({"params": params}, *inputs, 0.0, method="img_step").mean
+            return networks.applied(usual, params, *inputs, 0.0, method="img_step").mean
 
         means = predictions(predict, StoredHeads(**self.stored), (state, action))
         x = self.stoch_in(state.stochastic) + self.action_in(action)

@@ -53,7 +53,6 @@ class Task:
 
     def described(self) -> str:
         """What it is, in words."""
-        assert self.run.spec is not None  # only what is damaged has none
         agents = f"{len(self.run.cells)} agents" if len(self.run.cells) > 1 else "1 agent"
         return f"{self.title or self.name}: {agents} on {' + '.join(self.run.spec.tasks)}"
 

@@ -2,14 +2,14 @@
 
 import dataclasses
 import multiprocessing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from experiments.thesis import estimate
 from experiments.thesis.engines import Resources
-from experiments.thesis.estimate import DUE, Estimate
-from experiments.thesis.graph import PlannedRun
+from experiments.thesis.estimate import Estimate
+from experiments.thesis.graph import Graph, PlannedRun, due
 from experiments.thesis.speeds import cache_folder, kept
 
 PROGRAM_GIB = 3.0
@@ -17,7 +17,7 @@ PROGRAM_GIB = 3.0
 
 
 def demands(
-    runs: Sequence[PlannedRun], asked: Resources, folder: Path | None = None
+    runs: Graph, asked: Resources, folder: Path | None = None
 ) -> Callable[[PlannedRun], Resources]:
     """What each run gets: memory and hours that are not asked for are estimated where `plan` has
     measured this machine, and left open elsewhere.
@@ -46,9 +46,8 @@ def demands(
     return demand
 
 
-def estimates(runs: Sequence[PlannedRun], folder: Path) -> dict[str, Estimate]:
+def estimates(runs: Graph, folder: Path) -> dict[str, Estimate]:
     """What each run that is due still takes, by name; nothing if this machine is not measured."""
-    due = [run for run in runs if run.state in DUE]
-    specs = [run.spec for run in due if run.spec is not None]
-    known = kept(specs, folder) if specs else None
-    return {} if known is None else {run.name: estimate.estimate(run, known.speed) for run in due}
+    left = due(runs)
+    known = kept([run.spec for run in left], folder) if left else None
+    return {} if known is None else {run.name: estimate.estimate(run, known.speed) for run in left}
