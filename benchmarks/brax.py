@@ -3,28 +3,32 @@
     python -m benchmarks.brax [task=brax/hopper,...] [P=1,8] [image_size=32,64] [steps=100]
                               [repetitions=3]
 
-Prints one line of JSON (and each result as it is known to the standard error). Processor time is
-that of this process and of the one that draws for MuJoCo, so that what else the machine does
-matters little. It is read in parts, in turns: a rollout with rays at the first size ("physics" is
-what is left of it without pictures), as many pictures by rays alone, and as many by MuJoCo through
-the host callback alone. Processor times add up, so a rollout is its physics and its pictures;
-"ratio" is that with MuJoCo over that with rays, "drawing" the share of rays in the latter.
-"compile" and "trace" are processor seconds too, of the rollout's program. The least of the
-repetitions counts.
+Prints one line of JSON (and each result as it is known to the standard error). What is timed is
+what a run does to collect: one program of resets, physics, pictures, policy (networks of the preset
+`cpu`) and records, drawn by either renderer, in turns. Processor time is that of this process and
+of the one that draws for MuJoCo, so that what else the machine does matters little; rates are
+medians of the repetitions, "ratio" the median of those of each turn. "drawing" is the share of a
+rollout with rays that as many pictures by rays alone take, read in the same turns; "trace" and
+"compile" are processor seconds of the program with rays.
 """
 
 from __future__ import annotations
 
 import json
-import os
+import statistics
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
 import envs
+from dreamer_jax.agent import Agent
+from dreamer_jax.config import preset
+from dreamer_jax.population import init_members
+from dreamer_jax.rollout import collect
 
 DEFAULTS = {
     "task": ",".join(name for name in envs.task_names() if name.startswith("brax/")),
@@ -42,11 +46,12 @@ class Clock:
         self._processes = tuple(processes)
 
     def now(self) -> float:
-        ticks = 0
-        for process in self._processes:
-            fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
-            ticks += int(fields[11]) + int(fields[12])
-        return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
+        spent = sum(
+            int(thread.read_text().split()[0])
+            for process in self._processes
+            for thread in Path(f"/proc/{process}/task").glob("*/schedstat")
+        )
+        return time.process_time() + spent / 1e9
 
     def seconds(self, function, *arguments) -> float:
         """What a call takes, its result included."""
@@ -55,85 +60,103 @@ class Clock:
         return self.now() - started
 
 
-def rollout(env, members: int, steps: int):
-    """A compiled rollout of random actions, and processor seconds to trace and to compile it."""
+class Rollout:
+    """The compiled phase of one task, as a run collects it.
 
-    def run(key):
-        slots, keys = jnp.arange(members), jax.random.split(key, members)
-        state, _ = jax.vmap(env.reset)(slots, keys)
-        actions = jax.random.uniform(key, (steps, members, env.action_size), minval=-1.0)
-        return jax.lax.scan(jax.vmap(env.step), state, actions)[1]
+    Attributes:
+      trace, compile: processor seconds that these took.
+    """
 
-    started = time.process_time()
-    lowered = jax.jit(run).lower(jax.random.key(0))
-    traced = time.process_time()
-    program = lowered.compile()
-    return program, traced - started, time.process_time() - traced
+    def __init__(self, name: str, members: int, image_size: int, steps: int):
+        config = preset("cpu")
+        config = replace(config, network=replace(config.network, image_size=image_size))
+        self._env = envs.make([name], members, image_size, workers=1)
+        agent = Agent(config, self._env.action_size)
+        seeds, number = jnp.arange(members), jnp.int32(0)
+        state = init_members(agent, seeds)
+        self._arguments = (state.params, seeds, state.updates, number)
 
+        def phase(params, seeds, updates, number):
+            return collect(
+                agent, self._env, params, seeds, updates, number, tasks=1, ticks=steps,
+                mode="explore",
+            )  # fmt: skip
 
-def rays(env, task, members: int, steps: int):
-    """As many pictures by rays, of what the joints of a start are and of places near it."""
-    from envs.brax_physics import physics_of, task_scene
-    from envs.ray_casting import render
+        started = time.process_time()
+        lowered = jax.jit(phase).lower(*self._arguments)
+        self.trace = time.process_time() - started
+        started = time.process_time()
+        self._program = lowered.compile()
+        self.compile = time.process_time() - started
+        pool = getattr(self._env, "_pool", None)
+        self._clock = Clock(worker.process.pid for worker in pool._workers) if pool else Clock()
 
-    physics, scene = physics_of(task.title, task.physics), task_scene(task.title)
-    links = len(physics.env.sys.link_parents)
-    turned = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (links, 1))
+    def seconds(self) -> float:
+        """Processor seconds of the phase."""
+        found = self._clock.seconds(self._program, *self._arguments)
+        self._env.check()
+        return found
 
-    def tick(_, move):
-        places = jnp.array([0.0, 0.0, 0.7]) + move[:, None, None] * jnp.ones((links, 1))
-        return None, jax.vmap(lambda x: render(scene, x, turned, env.image_size))(places)
-
-    moves = jnp.linspace(0, 0.1, steps * members).reshape(steps, members)
-    return jax.jit(lambda moves: jax.lax.scan(tick, None, moves)[1]).lower(moves).compile(), moves
-
-
-def callbacks(env, members: int, steps: int):
-    """As many pictures by MuJoCo's process through the callback."""
-    slots = jnp.arange(members)
-
-    def tick(_, positions):
-        return None, env._images(slots, positions, jnp.zeros((members, 1)))[0]
-
-    positions = 0.1 * jax.random.normal(jax.random.key(0), (steps, members, env._positions))
-    program = jax.jit(lambda positions: jax.lax.scan(tick, None, positions)[1])
-    return program.lower(positions).compile(), positions
+    def close(self) -> None:
+        self._env.close()
 
 
-def rows(name: str, populations, sizes, steps: int, repetitions: int):
-    """The results of one task."""
-    task, key = envs.spec(name), jax.random.key(1)
-    drawing = [envs.make([f"{name}:mujoco"], max(populations), size, workers=1) for size in sizes]
-    clocks = [Clock(w.process.pid for w in env._pool._workers) for env in drawing]
-    for members in populations:
-        made = [envs.make([name], members, size) for size in sizes]
-        program, traced, compiled = rollout(made[0], members, steps)
-        parts = {("rollout", sizes[0]): (Clock(), program, key)}
-        for env, host, clock, size in zip(made, drawing, clocks, sizes, strict=True):
-            parts["rays", size] = (Clock(), *rays(env, task, members, steps))
-            parts["mujoco", size] = (clock, *callbacks(host, members, steps))
-        found = {part: [] for part in parts}
-        for _ in range(repetitions + 1):
-            for part, (clock, *call) in parts.items():
-                found[part].append(clock.seconds(*call))
-        # The first of each warms up.
-        least = {part: min(seconds[1:]) / (steps * members) for part, seconds in found.items()}
-        physics = least["rollout", sizes[0]] - least["rays", sizes[0]]
-        row = {"task": name, "P": members}
-        row |= {"trace": round(traced, 1), "compile": round(compiled, 1)}
-        row["physics_ms"] = round(1000 * physics, 4)
-        for size in sizes:
-            by_rays, by_mujoco = physics + least["rays", size], physics + least["mujoco", size]
-            row[str(size)] = {
-                "rays": round(1 / by_rays, 1),
-                "mujoco": round(1 / by_mujoco, 1),
-                "ratio": round(by_mujoco / by_rays, 2),
-                "drawing": round(least["rays", size] / by_rays, 3),
-            }
-        yield row
-    for env in drawing:
-        env.check()
-        env.close()
+class Rays:
+    """As many pictures of a task by rays, in places near each other."""
+
+    def __init__(self, name: str, members: int, image_size: int, steps: int):
+        from envs.brax_physics import physics_of, task_scene
+        from envs.ray_casting import render
+
+        task = envs.spec(name)
+        links = len(physics_of(task.title, task.physics).env.sys.link_parents)
+        scene = task_scene(task.title)
+        turned = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (links, 1))
+
+        def tick(_, move):
+            places = jnp.array([0.0, 0.0, 0.7]) + move[:, None, None] * jnp.ones((links, 1))
+            return None, jax.vmap(lambda x: render(scene, x, turned, image_size))(places)
+
+        self._moves = jnp.linspace(0, 0.1, steps * members).reshape(steps, members)
+        program = jax.jit(lambda moves: jax.lax.scan(tick, None, moves)[1])
+        self._program = program.lower(self._moves).compile()
+
+    def seconds(self) -> float:
+        """Processor seconds of the pictures."""
+        return Clock().seconds(self._program, self._moves)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def result(name: str, members: int, image_size: int, steps: int, repetitions: int) -> dict:
+    """What there is to say of one task at one size."""
+    sizes = (members, image_size, steps)
+    parts = {
+        "rays": Rollout(name, *sizes),
+        "mujoco": Rollout(f"{name}:mujoco", *sizes),
+        "drawing": Rays(name, *sizes),
+    }
+    # The first of each warms up.
+    turns = [{part: one.seconds() for part, one in parts.items()} for _ in range(repetitions + 1)]
+    turns = turns[1:]
+    for one in parts.values():
+        one.close()
+
+    def median(figure) -> float:
+        return statistics.median(figure(turn) for turn in turns)
+
+    return {
+        "task": name,
+        "P": members,
+        "image_size": image_size,
+        "rays": round(steps * members / median(lambda turn: turn["rays"]), 1),
+        "mujoco": round(steps * members / median(lambda turn: turn["mujoco"]), 1),
+        "ratio": round(median(lambda turn: turn["mujoco"] / turn["rays"]), 2),
+        "drawing": round(median(lambda turn: turn["drawing"] / turn["rays"]), 3),
+        "trace": round(parts["rays"].trace, 1),
+        "compile": round(parts["rays"].compile, 1),
+    }
 
 
 def main(arguments: list[str]) -> None:
@@ -147,9 +170,10 @@ def main(arguments: list[str]) -> None:
     steps, repetitions = int(settings["steps"]), int(settings["repetitions"])
     results = []
     for name in settings["task"].split(","):
-        for row in rows(name, populations, sizes, steps, repetitions):
-            print(json.dumps(row), file=sys.stderr, flush=True)
-            results.append(row)
+        for members in populations:
+            for size in sizes:
+                results.append(result(name, members, size, steps, repetitions))
+                print(json.dumps(results[-1]), file=sys.stderr, flush=True)
     unit = "agent steps per processor second"
     print(json.dumps({"benchmark": "brax", "unit": unit, "steps": steps, "results": results}))
 

@@ -4,7 +4,8 @@ Axis letters: P population member, K task, T ticks in a phase (a phase has T + 1
 A action. The environment is any object with `reset(slot, key) -> (state, TimeStep)` and
 `step(state, action) -> (state, TimeStep)` that is traceable and maps under `jax.vmap`, where a
 time step has the fields image, reward, first and terminal; after a terminal tick the next step
-resets.
+resets. It may have `before(slot, key) -> state` too, a state that the next step resets: then a
+program holds the environment once, not once for the reset and once for the steps.
 """
 
 import functools
@@ -39,6 +40,9 @@ def rollout(env, policy: Callable, carry, slot: jax.Array, key: jax.Array, ticks
       Records with leading axis T + 1.
     """
     env_key, policy_key = jax.random.split(key)
+    keys = jax.random.split(policy_key, ticks)
+    if hasattr(env, "before"):
+        return _rollout_of_steps(env, policy, carry, env.before(slot, env_key), keys)
     env_state, start = env.reset(slot, env_key)
 
     def tick(loop, key):
@@ -49,11 +53,26 @@ def rollout(env, policy: Callable, carry, slot: jax.Array, key: jax.Array, ticks
         action = jnp.where(time_step.first, 0.0, action)
         return (env_state, carry, time_step), (time_step, action)
 
-    _, (steps, actions) = jax.lax.scan(
-        tick, (env_state, carry, start), jax.random.split(policy_key, ticks)
-    )
+    _, (steps, actions) = jax.lax.scan(tick, (env_state, carry, start), keys)
     steps = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, steps)
     actions = jnp.concatenate([jnp.zeros_like(actions[:1]), actions])
+    return Records(steps.image, actions, steps.reward, steps.first, steps.terminal)
+
+
+def _rollout_of_steps(env, policy: Callable, carry, env_state, keys: jax.Array) -> Records:
+    """The same, from a state that the first step resets."""
+
+    def tick(loop, key):
+        env_state, carry, action = loop
+        env_state, time_step = env.step(env_state, action)
+        action = jnp.where(time_step.first, 0.0, action)
+        chosen, carry = policy(carry, time_step.image, time_step.first, key)
+        return (env_state, carry, chosen), (time_step, action)
+
+    # What is chosen after the last tick is not played.
+    keys = jnp.concatenate([keys, keys[-1:]])
+    start = (env_state, carry, jnp.zeros(env.action_size))
+    _, (steps, actions) = jax.lax.scan(tick, start, keys)
     return Records(steps.image, actions, steps.reward, steps.first, steps.terminal)
 
 

@@ -126,6 +126,17 @@ class Env(Protocol):
         ...
 
 
+LEAST_SIZE = 8
+"""Height and width in pixels of the smallest pictures that are drawn of Brax's tasks."""
+
+
+def check_whole(what: str, value: Any, least: int) -> None:
+    """Raise a ValueError that begins with "got `what`" unless a value is a whole number of at least
+    `least`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"got {what}{value!r}, expected a whole number of at least {least}")
+
+
 class SimulatorError(RuntimeError):
     """A simulator failed, or was used in a way that it cannot follow."""
 

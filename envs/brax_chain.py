@@ -11,11 +11,15 @@ Q joint positions.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+# Accelerators would take less than float32 for products otherwise.
+einsum = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
 
 
 class Places(NamedTuple):
@@ -65,6 +69,13 @@ class Motions(NamedTuple):
 class Chain:
     """The tree of a system whose joints are hinges, slides and at most one free joint at its root.
 
+    Attributes:
+      mass: of links, float32 [L].
+      moved_by: float32 [L, D], 1 where a degree of freedom moves a link.
+      below: float32 [D, D], 1 where the second of two degrees of freedom comes before the first, or
+        is it, on the way from the root.
+      dof_links: int [D], the link of each degree of freedom.
+
     Args:
       system: a `brax.System`.
 
@@ -96,9 +107,9 @@ class Chain:
         self._levels()
         self._masks()
         inertia = system.link.inertia
-        self._mass = np.asarray(inertia.mass, np.float32)
+        self.mass = np.asarray(inertia.mass, np.float32)
         self._centres = np.asarray(inertia.transform.pos, np.float32)
-        turned = np.array([_rotation(q) for q in np.asarray(inertia.transform.rot)])
+        turned = np.array([rotation_of(q) for q in np.asarray(inertia.transform.rot)])
         self._inertia = np.asarray(
             turned @ np.asarray(inertia.i) @ turned.swapaxes(1, 2), np.float32
         )
@@ -141,7 +152,7 @@ class Chain:
             last.append(previous)
         self._before, self._last = before, np.array(last)
         self._matrices = np.asarray(np.stack(matrices, axis=1), np.float32)
-        self._node_of_dof, self._dof_link = np.array(node_of_dof), np.array(dof_link)
+        self._node_of_dof, self.dof_links = np.array(node_of_dof), np.array(dof_link)
         self._angular, self._linear = (
             np.asarray(angular, np.float32),
             np.asarray(linear, np.float32),
@@ -164,38 +175,59 @@ class Chain:
         ]
 
     def _masks(self) -> None:
-        links, dofs = len(self._parents), len(self._dof_link)
+        links, dofs = len(self._parents), len(self.dof_links)
         moves = np.zeros((links, dofs), np.float32)
         for number in range(links):
             link = number
             while link >= 0:
-                moves[number, self._dof_link == link] = 1
+                moves[number, self.dof_links == link] = 1
                 link = self._parents[link]
         earlier = np.arange(dofs)[None] < np.arange(dofs)[:, None]
-        before = moves[self._dof_link] * earlier
+        before = moves[self.dof_links] * earlier
         if self._free:
             # Turning about the link's own axes follows its place, and no more.
             before[:6] = 0
             before[3:6, :3] = 1
-        self._moved_by, self._after = moves, before
+        self.moved_by, self._after = moves, before
+        self.below = moves[self.dof_links] * np.tril(np.ones((dofs, dofs), np.float32))
+
+    def angles(self, q: jax.Array) -> jax.Array:
+        """Positions of degrees of freedom, float32 [n, D], at joint positions float32 [n, Q]. Those
+        of a free joint's turns are none."""
+        return jnp.concatenate([q[:, :6], q[:, 7:]], axis=1) if self._free else q
+
+    def advanced(self, q: jax.Array, qd: jax.Array, step: float) -> jax.Array:
+        """Joint positions float32 [n, Q], `step` seconds later at joint velocities [n, D]."""
+        if not self._free:
+            return q + step * qd
+        speed = jnp.sqrt(jnp.square(qd[:, 3:6]).sum(1, keepdims=True)) + 1e-8
+        half = 0.5 * step * speed
+        turn = jnp.concatenate([jnp.cos(half), jnp.sin(half) / speed * qd[:, 3:6]], axis=1)
+        left = einsum("ijk,nk->nij", np.asarray(_LEFT, np.float32), q[:, 3:7])
+        turned = (left * turn[:, None]).sum(2)
+        turned /= jnp.sqrt(jnp.square(turned).sum(1, keepdims=True))
+        moved = q[:, :3] + step * qd[:, :3]
+        return jnp.concatenate([moved, turned, q[:, 7:] + step * qd[:, 6:]], axis=1)
 
     def places(self, q: jax.Array) -> Places:
         """Where links are at joint positions float32 [n, Q]."""
-        # One position for each node; that of a free joint is not used so.
-        angles = jnp.concatenate([q[:, :1], q[:, 7:]], axis=1) if self._free else q
+        angles = self.angles(q)
+        if self._free:
+            # One position for each node; that of a free joint is not used.
+            angles = angles[:, 5:]
         halves = jnp.stack([angles, angles / 2], axis=2)[..., None, None]
         constant, sine, cosine, slide = self._matrices
         parts = constant + sine * jnp.sin(halves) + cosine * jnp.cos(halves) + slide * halves
         joined: list[jax.Array] = []
         for nodes, before in zip(self._level_nodes, self._level_before, strict=True):
-            level = _chosen(parts, nodes)
+            level = picked(parts, nodes)
             if joined:
-                level = _product(_chosen(joined[-1], before), level)
+                level = _product(picked(joined[-1], before), level)
             elif self._free:
                 level = _free_frame(q)[:, None]
             joined.append(level)
-        frames = _chosen(jnp.concatenate(joined, axis=1), self._order)
-        last = _chosen(frames, self._last)
+        frames = picked(jnp.concatenate(joined, axis=1), self._order)
+        last = picked(frames, self._last)
         quaternions = last[:, :, 1, :, 0]
         rotations = frames[:, :, 0, :3, :3]
         if self._free:
@@ -205,25 +237,25 @@ class Chain:
             turning = rotations / square[..., None]
         else:
             turning = rotations
-        of_links = _chosen(rotations, self._last)
-        positions = last[:, :, 0, :3, 3] - _turned(of_links, self._joints)
-        of_dofs = _chosen(turning, self._node_of_dof)
-        slides = _turned(of_dofs, self._linear)
-        anchors = _chosen(frames[:, :, 0, :3, 3], self._node_of_dof)
-        turning = _chosen(turning, self._last)
+        of_links = picked(rotations, self._last)
+        positions = last[:, :, 0, :3, 3] - rotated(of_links, self._joints)
+        of_dofs = picked(turning, self._node_of_dof)
+        slides = rotated(of_dofs, self._linear)
+        anchors = picked(frames[:, :, 0, :3, 3], self._node_of_dof)
+        turning = picked(turning, self._last)
         if self._free:
             slides = jnp.where((np.arange(slides.shape[1]) < 6)[:, None], self._linear, slides)
-            hinges = _chosen(positions, self._parents[1:])
-            hinges += _turned(_chosen(turning, self._parents[1:]), self._offsets[1:])
+            hinges = picked(positions, self._parents[1:])
+            hinges += rotated(picked(turning, self._parents[1:]), self._offsets[1:])
             anchors = jnp.concatenate([anchors[:, :6], hinges], axis=1)
         return Places(
-            positions, quaternions, turning, _turned(of_dofs, self._angular), slides, anchors
+            positions, quaternions, turning, rotated(of_dofs, self._angular), slides, anchors
         )
 
     def motions(self, places: Places, qd: jax.Array) -> Motions:
         """Inertia and motion at joint velocities float32 [n, D]."""
-        centres = places.positions + _turned(places.rotations, self._centres)
-        weights = self._mass / self._mass.sum()
+        centres = places.positions + rotated(places.rotations, self._centres)
+        weights = self.mass / self.mass.sum()
         centre = (centres * weights[:, None]).sum(1)
         offsets = centres - centre[:, None]
         turned = _product(
@@ -231,29 +263,29 @@ class Chain:
         )
         square = jnp.square(offsets).sum(2)[..., None, None] * np.eye(3, dtype=np.float32)
         steiner = square - offsets[..., :, None] * offsets[..., None, :]
-        inertia = turned + self._mass[:, None, None] * steiner
+        inertia = turned + self.mass[:, None, None] * steiner
         turns = places.axes
-        moves = places.slides + _cross(places.anchors - centre[:, None], turns)
+        moves = places.slides + cross_products(places.anchors - centre[:, None], turns)
         both = jnp.concatenate([turns, moves], axis=2)
         flows = both * qd[..., None]
-        link = jnp.einsum("ld,ndk->nlk", self._moved_by, flows)
-        earlier = jnp.einsum("ed,ndk->nek", self._after, flows)
+        link = einsum("ld,ndk->nlk", self.moved_by, flows)
+        earlier = einsum("ed,ndk->nek", self._after, flows)
         turn, move = earlier[..., :3], earlier[..., 3:]
         return Motions(
             centre,
-            offsets * self._mass[:, None],
+            offsets * self.mass[:, None],
             inertia,
             turns,
             moves,
             link[..., :3],
             link[..., 3:],
-            _cross(turn, turns),
-            _cross(turn, moves) + _cross(move, turns),
+            cross_products(turn, turns),
+            cross_products(turn, moves) + cross_products(move, turns),
         )
 
 
-def _chosen(values: jax.Array, places) -> jax.Array:
-    """values[:, places], without an index computed as the program runs."""
+def picked(values: jax.Array, places) -> jax.Array:
+    """values[:, places] of values [n, ...], without an index computed as the program runs."""
     places = [int(place) for place in places]
     if places == list(range(values.shape[1])):
         return values
@@ -267,12 +299,12 @@ def _product(one: jax.Array, other: jax.Array | np.ndarray) -> jax.Array:
     return (one[..., :, :, None] * other[..., None, :, :]).sum(-2)
 
 
-def _turned(rotations: jax.Array, vectors: jax.Array | np.ndarray) -> jax.Array:
+def rotated(rotations: jax.Array, vectors: jax.Array | np.ndarray) -> jax.Array:
     """Rotations [..., 3, 3] times vectors [..., 3]."""
     return (rotations * vectors[..., None, :]).sum(-1)
 
 
-def _cross(one: jax.Array, other: jax.Array) -> jax.Array:
+def cross_products(one: jax.Array, other: jax.Array) -> jax.Array:
     """Cross products of [..., 3]."""
 
     def rolled(x):
@@ -284,8 +316,8 @@ def _cross(one: jax.Array, other: jax.Array) -> jax.Array:
 def _free_frame(q: jax.Array) -> jax.Array:
     """Both matrices of a free joint, float32 [n, 2, 4, 4]; its quaternion need not be of length 1,
     and then scales."""
-    left = jnp.einsum("ijk,nk->nij", np.asarray(_LEFT, np.float32), q[:, 3:7])
-    right = jnp.einsum("ijk,nk->nij", np.asarray(_RIGHT_INVERSE, np.float32), q[:, 3:7])
+    left = einsum("ijk,nk->nij", np.asarray(_LEFT, np.float32), q[:, 3:7])
+    right = einsum("ijk,nk->nij", np.asarray(_RIGHT_INVERSE, np.float32), q[:, 3:7])
     turn = _product(left, right)[:, 1:, 1:]
     top = jnp.concatenate([turn, q[:, :3, None]], axis=2)
     bottom = jnp.broadcast_to(np.asarray([0, 0, 0, 1], np.float32), (len(q), 1, 4))
@@ -306,7 +338,7 @@ def _left(quaternion) -> np.ndarray:
     return _LEFT @ np.asarray(quaternion, np.float64)
 
 
-def _rotation(quaternion) -> np.ndarray:
+def rotation_of(quaternion) -> np.ndarray:
     """The rotation [3, 3] of a quaternion of length 1."""
     quaternion = np.asarray(quaternion, np.float64)
     return (_left(quaternion) @ (_RIGHT_INVERSE @ quaternion))[1:, 1:]
@@ -315,7 +347,7 @@ def _rotation(quaternion) -> np.ndarray:
 def _frame(position, quaternion=(1, 0, 0, 0)) -> np.ndarray:
     """A frame as a matrix [4, 4]."""
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = _rotation(quaternion), position
+    frame[:3, :3], frame[:3, 3] = rotation_of(quaternion), position
     return frame
 
 

@@ -15,13 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from envs.brax_chain import Chain
+from envs.brax_forces import Forces
 from envs.brax_physics import Physics, brax_state, quiet
 
 # isort: split
 # After the module above, which keeps what Brax says on import to itself.
-from brax import actuator
-from brax.base import Inertia, Motion, Transform
-from brax.generalized import constraint, dynamics, integrator, mass
+from brax.base import Transform
 
 
 class Episodes:
@@ -68,81 +67,74 @@ class Episodes:
 
 
 class _Held(NamedTuple):
-    """States of the generalized engine, as much of each as the next step needs.
+    """States of the generalized engine, as much of each as the next step and the picture need.
 
     Attributes:
       q: float32 [n, Q], joint positions.
       qd: float32 [n, D], joint velocities.
-      inverse: float32 [n, D, D], of the mass matrix, as the last step knew it.
       positions: float32 [n, L, 3], of links.
       quaternions: float32 [n, L, 4].
-      new: bool [n], no step was made: the inverse is not known.
     """
 
     q: jax.Array
     qd: jax.Array
-    inverse: jax.Array
     positions: jax.Array
     quaternions: jax.Array
-    new: jax.Array
 
 
 class GeneralizedEpisodes(Episodes):
     """Episodes in Brax's generalized engine, whose step is written out once.
 
     Brax ends a step, and the making of a state, with all that the next step needs. Here a step
-    begins with that, so that positions, velocities and the inverse of the mass matrix are all
-    that passes from one to the next, and a start needs no more than a draw of these.
+    begins with that, so that positions and velocities are all that passes from one to the next,
+    and a start needs no more than a draw of these.
     """
 
     def __init__(self, physics: Physics, repeat: int):
         super().__init__(physics, repeat)
-        self._system, self._env = physics.env.sys, physics.env
-        self._chain = Chain(self._system)
+        self._env = physics.env
+        self._chain = Chain(physics.env.sys)
+        self._forces = Forces(physics.env.sys, self._chain)
         empty = jax.eval_shape(physics.start, jax.random.key(0))
         self._empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
 
     def begin(self, keys: jax.Array) -> _Held:
-        return self._placed(self._starts(keys))
-
-    def _starts(self, keys: jax.Array) -> _Held:
-        """Where n episodes start, the places of links not known yet."""
         drawn = jax.vmap(self._drawn)(keys)
-        return _held(drawn, jnp.ones(len(drawn.q), bool))
+        return self._placed(drawn.q, drawn.qd)
 
-    def _placed(self, states: _Held) -> _Held:
+    def _placed(self, q: jax.Array, qd: jax.Array) -> _Held:
         """States with the places of links as their joints say."""
-        places = self._chain.places(states.q)
-        return states._replace(positions=places.positions, quaternions=places.quaternions)
+        places = self._chain.places(q)
+        return _Held(q, qd, places.positions, places.quaternions)
 
     def physics_state(self, state: _Held) -> Any:
         def one(state):
             places = Transform(state.positions, state.quaternions)
-            return self._empty.replace(q=state.q, qd=state.qd, x=places, mass_mx_inv=state.inverse)
+            return self._empty.replace(q=state.q, qd=state.qd, x=places)
 
         return jax.vmap(one)(state)
 
     def tick(self, states, actions, ended, keys):
-        # Starts are not moved, but placed by the steps of the others.
-        states = jax.lax.cond(
-            ended.any(), lambda: _chosen(ended, self._starts(keys), states), lambda: states
-        )
+        def started():
+            # Not moved, but placed by the steps of the others.
+            return _chosen(ended, _held(jax.vmap(self._drawn)(keys)), states)
+
+        states = jax.lax.cond(ended.any(), started, lambda: states)
         actions = jnp.clip(actions, -1.0, 1.0)
         commands = jax.vmap(self._command)(self.physics_state(states), actions)
 
         def environment_step(carry, _):
             before, rewards, over = carry
 
-            def physics_step(_, state):
-                moved = self._physics_step(state, commands)
-                return _chosen(over | ended, state, moved)
+            def physics_step(_, moving):
+                return _chosen(over | ended, moving, self._physics_step(moving, commands))
 
-            after = jax.lax.fori_loop(0, self._env._n_frames, physics_step, before)
-            after = self._placed(after)
+            moving = (before.q, before.qd)
+            after = self._placed(*jax.lax.fori_loop(0, self._env._n_frames, physics_step, moving))
             judged, reward, terminal = jax.vmap(self._outcome)(
                 self.physics_state(before), self.physics_state(after), actions
             )
-            kept = _chosen(ended, after, _held(judged, after.new))
+            kept = _chosen(ended, after, _held(judged))
             return (kept, rewards + jnp.where(over, 0.0, reward), over | terminal), None
 
         nothing = jnp.zeros(len(ended))
@@ -152,61 +144,11 @@ class GeneralizedEpisodes(Episodes):
             )
         return after, jnp.where(ended, 0.0, rewards), over & ~ended
 
-    def _physics_step(self, states: _Held, commands: jax.Array) -> _Held:
-        """One physics step of n states."""
-        system = self._system
-        places = self._chain.places(states.q)
-        motions = self._chain.motions(places, states.qd)
-        links = len(system.link_parents)
-
-        def known(state, place, motion):
-            return self._empty.replace(
-                q=state.q,
-                qd=state.qd,
-                x=Transform(place.positions, place.quaternions),
-                root_com=jnp.tile(motion.centre, (links, 1)),
-                cinr=Inertia(
-                    # The quaternions of inertias are not looked at.
-                    Transform(motion.moments, jnp.zeros((links, 4))),
-                    motion.inertia,
-                    system.link.inertia.mass,
-                ),
-                cd=Motion(motion.link_turns, motion.link_moves),
-                cdof=Motion(motion.turns, motion.moves),
-                cdofd=Motion(motion.turns_rate, motion.moves_rate),
-                mass_mx_inv=state.inverse,
-            )
-
-        def moved(state, command):
-            state = constraint.jacobian(system, state)
-            torques = actuator.to_tau(system, command, state.q, state.qd)
-            state = state.replace(qf_smooth=dynamics.forward(system, state, torques))
-            state = state.replace(qf_constraint=constraint.force(system, state))
-            return integrator.integrate(system, state)
-
-        before = jax.vmap(known)(states, places, motions)
-        before = self._inverted(before, states.new)
-        after = jax.vmap(moved)(before, commands)
-        return _held(after, jnp.zeros_like(states.new))
-
-    def _inverted(self, states, new: jax.Array):
-        """States with their mass matrices and the inverses of these: made better from those of the
-        step before, but those of the new ones made from nothing."""
-        matrices = jax.vmap(lambda state: mass.matrix(self._system, state))(states)
-
-        def exact():
-            identity = jnp.broadcast_to(jnp.eye(matrices.shape[1]), matrices.shape)
-            return jax.scipy.linalg.solve(matrices, identity, assume_a="pos")
-
-        steps = self._system.matrix_inv_iterations
-        if steps:
-            inverses = improved_inverses(matrices, states.mass_mx_inv, new, steps)
-            inverses = jax.lax.cond(
-                new.any(), lambda: _chosen(new, exact(), inverses), lambda: inverses
-            )
-        else:
-            inverses = exact()
-        return states.replace(mass_mx=matrices, mass_mx_inv=inverses)
+    def _physics_step(self, moving, commands):
+        """Positions and velocities of n states after one physics step."""
+        q, qd = moving
+        places = self._chain.places(q)
+        return self._forces.moved(q, qd, places, self._chain.motions(places, qd), commands)
 
     # What Brax's environment adds to its engine, found out by standing in for the engine.
 
@@ -247,58 +189,9 @@ def _standing_in(env, **methods: Callable):
     return env
 
 
-_EXACT = 1e-6
-"""What an inverse times its matrix may be off the identity by (Frobenius norm): float32 knows no
-better, and Newton's next step after 1e-3 is there."""
-
-
-def improved_inverses(matrices, inverses, known: jax.Array, steps: int) -> jax.Array:
-    """Inverses of matrices [n, D, D], by Newton's method from those of nearby matrices.
-
-    Brax makes the same steps (Schulz's), and all of them whether or not they change anything.
-
-    Args:
-      matrices: symmetric, positive definite.
-      inverses: of matrices near them.
-      known: bool [n], which need no inverse.
-      steps: how many are made at most.
-    """
-    identity = jnp.eye(matrices.shape[1])
-
-    def off(inverses):
-        rest = identity - matrices @ inverses
-        return rest, jnp.sqrt(jnp.square(rest).sum((1, 2)))
-
-    rest, error = off(inverses)
-    # Far from the inverse there is a start from which the steps lead to it.
-    far = (error > 1)[:, None, None]
-    scale = jnp.square(matrices).sum((1, 2))[:, None, None]
-    inverses = jnp.where(far, 0.5 * matrices / scale, inverses)
-
-    def step(carry):
-        count, inverses, rest, error, _ = carry
-        better = inverses + inverses @ rest
-        new_rest, new_error = off(better)
-        closer = new_error < error
-        chosen = closer[:, None, None]
-        going = closer & (new_error > _EXACT) & ~known
-        return (
-            count + 1,
-            jnp.where(chosen, better, inverses),
-            jnp.where(chosen, new_rest, rest),
-            jnp.where(closer, new_error, error),
-            going,
-        )
-
-    rest, error = off(inverses)
-    going = (error > _EXACT) & ~known
-    start = (0, inverses, rest, error, going)
-    return jax.lax.while_loop(lambda carry: (carry[0] < steps) & carry[-1].any(), step, start)[1]
-
-
-def _held(state, new: jax.Array) -> _Held:
+def _held(state) -> _Held:
     """What is held of n of Brax's states."""
-    return _Held(state.q, state.qd, state.mass_mx_inv, state.x.pos, state.x.rot, new)
+    return _Held(state.q, state.qd, state.x.pos, state.x.rot)
 
 
 def _chosen(chosen: jax.Array, new, old):

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from envs.base import TaskSpec
+from envs.base import LEAST_SIZE, TaskSpec, check_whole
 from envs.wrappers import ActionRepeat, TimeLimit, make_simulator
 
 
@@ -25,6 +25,9 @@ class PixelEnv(gymnasium.Env):
       action_repeat: environment steps for which an action is held, whose rewards are summed;
         by default the task's.
       render_mode: "rgb_array" to have `render` return the picture of the present state.
+
+    Raises:
+      ValueError: for an image size that is none, or below 8 for Brax's tasks.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -36,6 +39,8 @@ class PixelEnv(gymnasium.Env):
         action_repeat: int | None = None,
         render_mode: str | None = None,
     ):
+        least = LEAST_SIZE if task.name.startswith("brax/") else 1
+        check_whole("an image size of ", image_size, least)
         self._task = task
         self._image_size = image_size
         self._action_repeat = task.action_repeat if action_repeat is None else action_repeat

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.base import LEAST_SIZE, check_whole
 from envs.scene import Camera, Checker, Scene
 
 _FAR_AWAY = jnp.inf
@@ -29,14 +30,8 @@ _FAR_AWAY = jnp.inf
 
 def check_size(size: Any, supersample: Any = 1) -> None:
     """Raise a ValueError unless pictures can have this size in pixels."""
-    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 8:
-        raise ValueError(f"got an image size of {size!r}, expected a whole number of at least 8")
-    if (
-        isinstance(supersample, bool)
-        or not isinstance(supersample, (int, np.integer))
-        or supersample < 1
-    ):
-        raise ValueError(f"got supersample={supersample!r}, expected a whole number of at least 1")
+    check_whole("an image size of ", size, LEAST_SIZE)
+    check_whole("supersample=", supersample, 1)
 
 
 def render(

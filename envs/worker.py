@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.base import Simulator, TaskSpec, TimeStep
+from envs.base import Simulator, SimulatorError, TaskSpec, TimeStep
 from envs.wrappers import ActionPadding, ActionRepeat, make_simulator
 
 # Seconds for which either end asks again for the other's message before it falls asleep.
@@ -210,6 +210,8 @@ def _first_problem(settings: WorkerSettings) -> StartFailure | None:
             problem = _try(task, settings)
         except ModuleNotFoundError as error:
             return StartFailure(slot, str(error), traceback.format_exc(), is_missing=True)
+        except SimulatorError as error:  # says all there is to say
+            return StartFailure(slot, str(error))
         except BaseException as error:  # SystemExit of a simulator too
             problem = f"{type(error).__name__}: {error}"
             return StartFailure(slot, problem, traceback.format_exc())

@@ -17,6 +17,15 @@ from envs.scene import Camera, Checker, Geometry, Light, Scene, scene_of
 
 DAYLIGHT = Light("head", diffuse=(0.0,) * 3, ambient=(1.0,) * 3)
 TITLES = [envs.spec(name).title for name in envs.task_names() if name.startswith("brax/")]
+# Decibels, of which 28 are the least for any task. Where most of a picture is white, a link that is
+# missing or of another colour costs less than 28 leave, so more is asked for there.
+LIKENESS = dict.fromkeys(TITLES, 28) | {
+    "HalfCheetah": 34,
+    "Hopper": 37,
+    "Walker2D": 37,
+    "InvertedPendulum": 38,
+    "InvertedDoublePendulum": 30,
+}
 
 EVERYTHING = """
 <mujoco>
@@ -306,7 +315,7 @@ def test_tasks_look_as_mujoco_draws_them(mujoco, drawing, title):
     shown = jax.jit(jax.vmap(lambda *pose: render(scene, *pose, size=64)))(places, turns)
     likeness = psnr(shown, expected)
     assert len(np.unique(expected, axis=0)) > 20, "it moves"
-    assert likeness.mean() > 28 and likeness.min() > 20, likeness
+    assert likeness.mean() > LIKENESS[title] and likeness.min() > 26, likeness
 
 
 def test_a_start_of_the_ant_is_drawn_with_a_whole_body(drawing):

@@ -60,6 +60,31 @@ def test_a_record_holds_the_action_that_led_to_its_image():
             assert_allclose(records.reward[t], 1 - 4 * (records.action[t, 0] - 0.5) ** 2, rtol=1e-5)
 
 
+class Beginning(Probe):
+    """A probe that can be made to begin with its next step."""
+
+    def before(self, slot, key):
+        state = self._start(key, jnp.int32(-1))
+        return state._replace(clock=state.limit)
+
+
+def test_an_environment_that_begins_with_a_step_gives_the_same_records():
+    def policy(carry, image, first, key):
+        seen = image[0, :, 0].argmax() / 32.0
+        carry = jnp.where(first, 0, carry) + 1
+        return jax.random.uniform(key, (2,)) * seen - 0.1 * carry, carry
+
+    found = [
+        jax.jit(lambda key, env=env: rollout(env, policy, jnp.int32(7), 0, key, 30))(
+            jax.random.key(3)
+        )
+        for env in (Probe(), Beginning())
+    ]
+    assert found[0].first.sum() > 2 and found[0].first[0]
+    assert_array_equal(found[0].first, found[1].first)
+    jax.tree.map(lambda one, two: assert_allclose(one, two, atol=1e-6), *found)
+
+
 def test_episodes_add_up_to_the_phase():
     records = run()
     found = episodes(records)
