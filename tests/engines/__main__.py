@@ -77,6 +77,9 @@ def _prepare(folder: Path) -> None:
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ["RAY_worker_niceness"] = "0"  # on a machine that does other work, too
+    # Where this was started in the background, which leaves no Ctrl-C to those that it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
