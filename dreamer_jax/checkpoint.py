@@ -12,10 +12,11 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from dreamer_jax.files import explained, sync_folder, write_json_atomically
@@ -140,7 +141,12 @@ class Checkpointer:
         """
         return _check(self.path(self._existing(step)))
 
-    def restore(self, template: Tree, step: int | None = None) -> tuple[Tree, dict[str, Any], int]:
+    def restore(
+        self,
+        template: Tree,
+        step: int | None = None,
+        put: Callable[[np.ndarray], jax.Array] | None = None,
+    ) -> tuple[Tree, dict[str, Any], int]:
         """Read a checkpoint back.
 
         Args:
@@ -149,6 +155,8 @@ class Checkpointer:
             are restored to the same devices.
           step: which one; by default the newest that can be read, with a warning for each that
             cannot.
+          put: brings the values of a leaf to where they are to lie, if not to the template's
+            devices.
 
         Returns:
           state, metadata and step.
@@ -164,7 +172,7 @@ class Checkpointer:
         for candidate in candidates:
             try:
                 self.check(candidate)
-                state = read_tree(self.path(candidate), template)
+                state = read_tree(self.path(candidate), template, put)
                 return state, self._metadata(candidate), candidate
             except CorruptCheckpointError as error:
                 problems.append(str(error))

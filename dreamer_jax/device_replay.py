@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay, record_dtype
 from dreamer_jax.schedule import Schedule
@@ -38,12 +39,21 @@ def record_bytes(image_size: int, action_size: int) -> int:
     return record_dtype(image_size, action_size).itemsize
 
 
-def empty(members: int, tasks: int, capacity: int, image_size: int, action_size: int) -> Records:
-    """A replay of zeros on the default device, leaves [P, K, C, ...]."""
+def empty(
+    members: int,
+    tasks: int,
+    capacity: int,
+    image_size: int,
+    action_size: int,
+    sharding: jax.sharding.Sharding | None = None,
+) -> Records:
+    """A replay of zeros, by default on the default device, leaves [P, K, C, ...]."""
     dtype = record_dtype(image_size, action_size)
     layouts = (dtype[name] for name in Records._fields)
     shape = (members, tasks, capacity)
-    return Records(*(jnp.zeros((*shape, *layout.shape), layout.base) for layout in layouts))
+    return Records(
+        *(jnp.zeros((*shape, *layout.shape), layout.base, device=sharding) for layout in layouts)
+    )
 
 
 def write(held: Records, records: Records, phase: jax.Array) -> Records:
@@ -78,13 +88,19 @@ def read(held: Records, tasks: jax.Array, starts: jax.Array, length: int) -> Rec
     return held.map(lambda leaf: one(leaf, tasks, places))
 
 
-def filled(files: Replay, capacity: int, records: int) -> Records:
+def filled(
+    files: Replay, capacity: int, records: int, placement: Placement | None = None
+) -> Records:
     """The newest records that the files hold, phase by phase.
 
     Args:
       files: the streams, all of one length.
       capacity: C.
       records: of one phase, T + 1.
+      placement: where members lie; by default all on one device.
+
+    Returns:
+      Leaves [P, K, C, ...], with the placement's padding.
 
     Raises:
       ValueError: the streams do not hold whole phases.
@@ -97,8 +113,10 @@ def filled(files: Replay, capacity: int, records: int) -> Records:
             "collected, or with replay=files"
         )
     size, actions = files.dtype["image"].shape[0], files.dtype["action"].shape[0]
-    held = empty(files.members, files.tasks, capacity, size, actions)
-    store = jax.jit(write, donate_argnums=0)
+    placement = placement or on_one_device(files.members)
+    sharding = placement.sharding()
+    held = empty(placement.padded, files.tasks, capacity, size, actions, sharding)
+    store = placement.over_devices(jax.jit(write, donate_argnums=0), axes=(0, 0, None), donate=(0,))
     oldest = max(0, held_records - (capacity if files.keep is None else files.keep))
     for phase in range(oldest // records, phases):
         # What is deleted is never sampled.
@@ -110,7 +128,7 @@ def filled(files: Replay, capacity: int, records: int) -> Records:
         ]
         rows = jax.tree.map(lambda *x: np.stack(x), *streams)
         rows = rows.map(lambda x: x.reshape(files.members, files.tasks, *x.shape[1:]))
-        held = store(held, rows, jnp.int32(phase))
+        held = store(held, placement.spread(rows), jnp.int32(phase))
     return held
 
 

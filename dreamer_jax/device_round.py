@@ -14,6 +14,7 @@ L sequence length, C capacity in records.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ import numpy as np
 
 from dreamer_jax import device_replay
 from dreamer_jax.agent import MODES, Agent, Mode
+from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.learning import AgentState
 from dreamer_jax.population import update_members
 from dreamer_jax.records import Records
@@ -45,7 +47,7 @@ def on_device(agent: Agent, has_host: bool, tasks: int, members: int) -> tuple[b
       agent: its functions and settings.
       has_host: whether anything of the environment runs on the host.
       tasks: K.
-      members: P.
+      members: P, of those on one device.
 
     Returns:
       Whether, and what to tell the user of it ("" where files are a matter of course).
@@ -131,6 +133,7 @@ def whole_round(
     mode: jax.Array,
     updates: jax.Array,
     drawn: tuple[jax.Array, jax.Array],
+    numbers: jax.Array | None = None,
     *,
     ticks: int,
     length: int,
@@ -150,6 +153,7 @@ def whole_round(
       mode: int32 [], index in `MODES`.
       updates: int32 [], how many of the U updates are made.
       drawn: int32 [U, P, B] each, the streams and the places in [0, C) of the updates' sequences.
+      numbers: int32 [P], see `dreamer_jax.rollout.collect`.
       ticks: T.
       length: L.
       mapping, chunk: see `dreamer_jax.population.map_members`.
@@ -159,7 +163,16 @@ def whole_round(
     """
     tasks = held.reward.shape[1]
     records = collect(
-        agent, env, state.params, seeds, state.updates, phase, tasks=tasks, ticks=ticks, mode=mode
+        agent,
+        env,
+        state.params,
+        seeds,
+        state.updates,
+        phase,
+        tasks=tasks,
+        ticks=ticks,
+        mode=mode,
+        numbers=numbers,
     )
     held = device_replay.write(held, records, phase)
 
@@ -182,15 +195,41 @@ class DeviceRounds:
       agent: the agent's functions.
       env: an environment without a host.
       files: the committed records.
-      seeds: int32 [P].
+      seeds: of the P members.
+      placement: where members lie, and so their replay; by default all on one device.
     """
 
-    def __init__(self, agent: Agent, env, files: Replay, seeds: jax.Array):
+    def __init__(
+        self,
+        agent: Agent,
+        env,
+        files: Replay,
+        seeds: Sequence[int],
+        placement: Placement | None = None,
+    ):
         self._agent, self._env, self._files = agent, env, files
         self._seeds = np.asarray(seeds, np.int32)
+        self._placement = placement or on_one_device(files.members)
+        # The axes of members: of state, sums, replay, seeds, ..., the places of sequences, numbers.
+        axes = (0, 0, 0, 0, None, None, None, 1, 0)
+        self._whole_round = self._placement.over_devices(self._one_round, axes, donate=(0, 1, 2))
+        self._spread_seeds = self._placement.spread(self._seeds)
+        self._numbers = self._placement.numbers()
         self._schedule = Schedule(agent.config.schedule, files.tasks)
         self._capacity = device_replay.capacity(self._schedule)
         self._held: Records | None = None
+
+    def _one_round(self, *arguments):
+        learning, schedule = self._agent.config.learning, self._agent.config.schedule
+        return whole_round(
+            self._agent,
+            self._env,
+            *arguments,
+            ticks=schedule.phase_ticks,
+            length=learning.sequence_length,
+            mapping=schedule.mapping,
+            chunk=schedule.mapping_chunk,
+        )
 
     def forget(self) -> None:
         """Frees the device's copy; the next round makes it anew from the files."""
@@ -215,33 +254,27 @@ class DeviceRounds:
         Raises:
           MemoryError: the device has no room for the round beside the replay; names the way out.
         """
-        learning, schedule = self._agent.config.learning, self._agent.config.schedule
-        ticks = schedule.phase_ticks
+        phase_records, placement = self._schedule.config.phase_ticks + 1, self._placement
         held, self._held = self._held, None
         try:
             if held is None:
-                held = device_replay.filled(self._files, self._capacity, ticks + 1)
-            state, sums, held, records = whole_round(
-                self._agent,
-                self._env,
+                held = device_replay.filled(self._files, self._capacity, phase_records, placement)
+            state, sums, held, records = self._whole_round(
                 state,
                 sums,
                 held,
-                self._seeds,
+                self._spread_seeds,
                 np.int32(rounds),
                 np.int32(MODES.index(mode)),
                 np.int32(len(updates)),
-                self._drawn(updates, ticks + 1),
-                ticks=ticks,
-                length=learning.sequence_length,
-                mapping=schedule.mapping,
-                chunk=schedule.mapping_chunk,
+                placement.spread(self._drawn(updates, phase_records), axis=1),
+                self._numbers,
             )
-            records = to_host(records)
+            records = placement.own(to_host(records))
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
-            size = _size(replay_bytes(self._agent, self._files.tasks, self._files.members))
+            size = _size(replay_bytes(self._agent, self._files.tasks, placement.each))
             raise MemoryError(
                 f"a round does not fit into the device's memory beside the replay's {size}: keep "
                 "fewer records (replay_keep), update fewer members at once (mapping=chunks), or "

@@ -1,16 +1,22 @@
 """Populations: the agent's functions over a leading axis P of members.
 
-Axis letters: P population member, B batch, L sequence length.
+Axis letters: P population member, K task, B batch, L sequence length, T ticks in a phase.
 """
 
+import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
-from dreamer_jax.agent import Agent
+from dreamer_jax.agent import MODES, Agent, Mode
+from dreamer_jax.devices import Placement
+from dreamer_jax.diagnosis import diagnose
+from dreamer_jax.freezing import Params
 from dreamer_jax.learning import AgentState
 from dreamer_jax.records import Records
+from dreamer_jax.rollout import collect
 
 
 def map_members(function, mapping: str, chunk: int = 1):
@@ -86,3 +92,101 @@ def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> 
     metrics = jax.eval_shape(agent.update, member, batch)[1]
     members = state.updates.shape[0]
     return {name: jnp.zeros(members, x.dtype) for name, x in metrics.items()}
+
+
+class Population:
+    """What an agent does, for all members: each device does it for its own.
+
+    P counts the padding of the placement, if members lie on several devices.
+
+    Args:
+      agent: the agent's functions.
+      env: an environment of P * K slots, see `dreamer_jax.rollout`.
+      tasks: K.
+      own_seeds: of the members.
+      placement: where they lie.
+
+    Attributes:
+      own_seeds: of the members.
+      seeds: int32 [P], the same on the devices.
+    """
+
+    def __init__(
+        self, agent: Agent, env, tasks: int, own_seeds: Sequence[int], placement: Placement
+    ):
+        self._agent, self._env, self._tasks = agent, env, tasks
+        self._placement, self._numbers = placement, placement.numbers()
+        self.own_seeds = list(own_seeds)
+        self.seeds = placement.spread(jnp.array(self.own_seeds, jnp.int32))
+        over = placement.over_devices
+        self._init = over(functools.partial(init_members, agent), axes=(0,))
+        self._update = over(self._update_members, axes=(0, 0, 0), donate=(0, 1))
+        self._collect = over(self._collect_members, axes=(0, 0, 0, None, None, 0))
+        self._diagnose = over(functools.partial(diagnose, agent), axes=(0, 0, 0, None))
+
+    def fresh(self) -> AgentState:
+        """Fresh agents of the members' seeds: leaves [P, ...]."""
+        return self.without_padding(self._init(self.seeds))
+
+    def put(self, state: AgentState) -> AgentState:
+        """Agents brought to their devices."""
+        return self.without_padding(self._placement.spread(state))
+
+    def without_padding(self, state: AgentState) -> AgentState:
+        """Agents of which padding is not healthy, so that nothing trains it."""
+        healthy = self._placement.without_padding(state.healthy)
+        return dataclasses.replace(state, healthy=healthy)
+
+    def zero_sums(self, state: AgentState) -> dict[str, jax.Array]:
+        """Sums of metrics before the first update, [P] each."""
+        learning = self._agent.config.learning
+        sums = zero_sums(self._agent, state, learning.batch_size, learning.sequence_length)
+        return jax.device_put(sums, self._placement.sharding())
+
+    def update(
+        self, state: AgentState, sums: dict[str, jax.Array], batch: Records
+    ) -> tuple[AgentState, dict[str, jax.Array], jax.Array]:
+        """One update of every member, see `update_members`; the batch is of the members alone."""
+        return self._update(state, sums, self._placement.spread(batch))
+
+    def _update_members(self, state, sums, batch):
+        schedule = self._agent.config.schedule
+        mapping, chunk = schedule.mapping, schedule.mapping_chunk
+        return update_members(self._agent, state, sums, batch, mapping=mapping, chunk=chunk)
+
+    def collect(self, state: AgentState, phase: int, mode: Mode) -> Records:
+        """One phase of every task by every member, see `dreamer_jax.rollout.collect`.
+
+        Returns:
+          Leaves [P, K, T + 1, ...].
+        """
+        numbers = jnp.int32(phase), jnp.int32(MODES.index(mode))
+        return self._collect(state.params, self.seeds, state.updates, *numbers, self._numbers)
+
+    def _collect_members(self, params, seeds, updates, phase, mode, numbers):
+        return collect(
+            self._agent,
+            self._env,
+            params,
+            seeds,
+            updates,
+            phase,
+            tasks=self._tasks,
+            ticks=self._agent.config.schedule.phase_ticks,
+            mode=mode,
+            numbers=numbers,
+        )
+
+    def diagnose(self, params: Params, records: Records, phase: int) -> dict[str, jax.Array]:
+        """What models know of a phase, see `dreamer_jax.diagnosis.diagnose`.
+
+        Args:
+          params: leaves [P, ...].
+          records: of the members alone, leaves [., K, T + 1, ...].
+          phase: its number.
+
+        Returns:
+          By name, float32 [P, K].
+        """
+        played = self._placement.spread(records)
+        return self._diagnose(params, played, self.seeds, jnp.int32(phase))

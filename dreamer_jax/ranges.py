@@ -70,16 +70,16 @@ def check_ranges(settings: Any) -> None:
         if dataclasses.is_dataclass(value):
             check_ranges(value)
             continue
-        if value is None and type(None) in kinds:
+        choices = [kind for kind in kinds if isinstance(kind, str)]
+        if (value is None and type(None) in kinds) or (isinstance(value, str) and value in choices):
             continue
         if "range" in entry.metadata:
             _check(entry.name, value, entry.metadata["range"], whole=int in kinds)
         elif bool in kinds and not isinstance(value, bool):
             raise ValueError(f"{entry.name} is {value!r}, expected true or false")
-        elif choices := [kind for kind in kinds if isinstance(kind, str)]:
-            if value not in choices:
-                known = ", ".join(map(repr, choices))
-                raise ValueError(f"{entry.name} is {value!r}, expected one of {known}")
+        elif choices and not (int in kinds and isinstance(value, int)):
+            known = ", ".join(map(repr, choices))
+            raise ValueError(f"{entry.name} is {value!r}, expected one of {known}")
 
 
 def _check(name: str, value: Any, allowed: Range, whole: bool) -> None:

@@ -87,6 +87,7 @@ def collect(
     tasks: int,
     ticks: int,
     mode: Mode | jax.Array,
+    numbers: jax.Array | None = None,
 ) -> Records:
     """One phase of every task by every member, all simulators in step.
 
@@ -103,16 +104,19 @@ def collect(
       ticks: T.
       mode: "random" (prefill), "explore" or "evaluate" (the mode, without noise); or its index in
         `MODES`, int32 [].
+      numbers: int32 [P], which members of the environment they are; by default 0 to P - 1.
 
     Returns:
       Records with leading axes [P, K, T + 1].
     """
     number = jnp.int32(MODES.index(mode)) if isinstance(mode, str) else mode
-    return _collect(agent, env, params, seeds, updates, phase, number, tasks=tasks, ticks=ticks)
+    return _collect(
+        agent, env, params, seeds, updates, phase, number, numbers, tasks=tasks, ticks=ticks
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("agent", "env", "tasks", "ticks"))
-def _collect(agent, env, params, seeds, updates, phase, mode, *, tasks, ticks) -> Records:
+def _collect(agent, env, params, seeds, updates, phase, mode, numbers, *, tasks, ticks) -> Records:
     """`collect` of a mode that is known only as it runs."""
 
     def one(params, seed, updates, task, slot):
@@ -123,7 +127,10 @@ def _collect(agent, env, params, seeds, updates, phase, mode, *, tasks, ticks) -
         return rollout(env, policy, agent.initial_carry(), slot, key, ticks)
 
     members = seeds.shape[0]
-    slots = jnp.arange(members * tasks).reshape(members, tasks)
+    if numbers is None:
+        slots = jnp.arange(members * tasks).reshape(members, tasks)
+    else:
+        slots = numbers[:, None] * tasks + jnp.arange(tasks)
     over_tasks = jax.vmap(one, in_axes=(None, None, None, 0, 0))
     over_members = jax.vmap(over_tasks, in_axes=(0, 0, 0, None, 0))
     return over_members(params, seeds, updates, jnp.arange(tasks), slots)

@@ -6,10 +6,11 @@ Both are on the disk before it is. Going on from it cuts them back to that, afte
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
@@ -57,12 +58,18 @@ class RunFolder:
             self._lock.release()
             raise
 
-    def restore(self, template: Any, step: int | None = None) -> tuple[Any, dict[str, int]] | None:
+    def restore(
+        self,
+        template: Any,
+        step: int | None = None,
+        put: Callable[[np.ndarray], jax.Array] | None = None,
+    ) -> tuple[Any, dict[str, int]] | None:
         """Goes back to a checkpoint: cuts replay and metrics back to what it committed.
 
         Args:
           template: see `Checkpointer.restore`.
           step: of the checkpoint; by default the newest that can be read. Later ones are removed.
+          put: see `Checkpointer.restore`.
 
         Returns:
           The state and the counters; None where nothing has been kept yet.
@@ -80,7 +87,7 @@ class RunFolder:
                     "this one away) to start again"
                 )
             return None
-        tree, metadata, found = self.checkpoints.restore(template, step)
+        tree, metadata, found = self.checkpoints.restore(template, step, put)
         check_shape(metadata, METADATA, self.checkpoints.path(found) / "metadata.json")
         checksums = metadata.get("checksums", {})
         lengths = np.asarray(metadata["replay"])

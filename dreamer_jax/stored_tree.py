@@ -12,7 +12,7 @@ import logging
 import os
 import re
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -88,8 +88,15 @@ def write_tree(folder: Path, tree: Any) -> None:
     write_json_atomically(folder / "leaves.json", {"format": _FORMAT, "leaves": table})
 
 
-def read_tree(folder: Path, template: Tree) -> Tree:
+def read_tree(
+    folder: Path, template: Tree, put: Callable[[np.ndarray], jax.Array] | None = None
+) -> Tree:
     """The pytree in a folder, with the structure of the template and on its devices.
+
+    Args:
+      folder: what `write_tree` has written.
+      template: of arrays or their shapes.
+      put: brings the values of a leaf to where they are to lie, if not to the template's devices.
 
     Raises:
       ValueError: structure, shapes or dtypes differ from the template's.
@@ -104,10 +111,10 @@ def read_tree(folder: Path, template: Tree) -> Tree:
     leaves = []
     for description, (_, leaf) in zip(expected, paths_and_leaves, strict=True):
         # Copied, so that no leaf shares memory with NumPy: updates may donate their buffers.
-        value = jnp.array(values[description.path])
+        value = (put or jnp.array)(values[description.path])
         if key_impls[description.path]:
             value = jax.random.wrap_key_data(value, impl=key_impls[description.path])
-        if getattr(leaf, "committed", False):
+        if put is None and getattr(leaf, "committed", False):
             value = jax.device_put(value, leaf.sharding)
         leaves.append(value)
     return jax.tree_util.tree_unflatten(structure, leaves)

@@ -21,14 +21,15 @@ import numpy as np
 
 from dreamer_jax.agent import Agent, Mode
 from dreamer_jax.device_round import DeviceRounds, on_device
-from dreamer_jax.diagnosis import diagnose, warnings
+from dreamer_jax.devices import Placement, on_one_device
+from dreamer_jax.diagnosis import warnings
 from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
-from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.population import Population
 from dreamer_jax.progress import Progress
 from dreamer_jax.record_checks import check_records
 from dreamer_jax.records import Records
-from dreamer_jax.rollout import collect, episodes
+from dreamer_jax.rollout import episodes
 from dreamer_jax.run_folder import RunFolder
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.stopping import StopRequest
@@ -84,6 +85,9 @@ class Run:
       videos: how many of the evaluations are also written as videos, spread over the run.
       from_checkpoint: step of an older checkpoint to continue from; later ones are removed.
       lock: the folder's lock, if the caller holds it; it is released with the run.
+      placement: where the members lie; by default all on one device. It is no part of what a run
+        is: one may be resumed on other devices. With several, an environment must be one for them:
+        its `shards` says how many.
 
     Raises:
       FolderInUseError: another process works in the folder.
@@ -105,8 +109,19 @@ class Run:
         videos: int = 10,
         from_checkpoint: int | None = None,
         lock: FolderLock | None = None,
+        placement: Placement | None = None,
     ):
         config = agent.config
+        placement = placement or on_one_device(len(members))
+        if placement.members != len(members):
+            raise ValueError(
+                f"{placement.members} members are placed, {len(members)} are named: place as many"
+            )
+        if (shards := getattr(env, "shards", 1)) != placement.count:
+            raise ValueError(
+                f"the environment is made for {shards} devices, the members lie on "
+                f"{placement.count}: build it with shards={placement.count}"
+            )
         if env.action_size != agent.action_size:
             raise ValueError(
                 f"the environment takes actions of size {env.action_size}, the agent gives "
@@ -128,10 +143,13 @@ class Run:
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
         self._one_program, self._replay_note = on_device(
-            agent, getattr(env, "has_host", True), len(self.tasks), len(self.members)
+            agent, getattr(env, "has_host", True), len(self.tasks), placement.each
         )
         self.videos = videos
-        self.seeds = jnp.array([member.seed for member in self.members], jnp.int32)
+        self.placement = placement
+        own_seeds = [member.seed for member in self.members]
+        self.population = Population(agent, env, len(self.tasks), own_seeds, placement)
+        self.seeds = self.population.seeds
         self.folder = RunFolder(
             self.directory,
             lock=lock,
@@ -154,33 +172,37 @@ class Run:
 
     def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
         """Takes up what the folder holds, or else the state given, or else fresh agents."""
-        agent = self.agent
+        agent, population = self.agent, self.population
         # Where rounds are one program each; None where updates read the files.
         self.device_rounds = (
-            DeviceRounds(agent, self.env, self.replay, self.seeds) if self._one_program else None
+            DeviceRounds(agent, self.env, self.replay, population.own_seeds, self.placement)
+            if self._one_program
+            else None
         )
         self.counters = Counters()
-        self.state = init_members(agent, self.seeds) if state is None else state
-        if self.state.updates.shape != (len(self.members),):
+        if state is not None and state.updates.shape != (len(self.members),):
             raise ValueError(
-                f"the state holds {self.state.updates.shape} members, {len(self.members)} are named"
+                f"the state holds {state.updates.shape} members, {len(self.members)} are named"
             )
-        learning = agent.config.learning
-        self.sums = zero_sums(agent, self.state, learning.batch_size, learning.sequence_length)
+        self.state = population.fresh() if state is None else population.put(state)
+        self.sums = population.zero_sums(self.state)
         self._restore(from_checkpoint)
         self._warned: set[tuple[int, str]] = set()
 
     def _restore(self, step: int | None = None) -> None:
         """Goes back to a checkpoint, by default the newest, if there is one."""
-        found = self.folder.restore({"agent": self.state, "sums": self.sums}, step)
+        tree = self.placement.own_shapes({"agent": self.state, "sums": self.sums})
+        put: Any = self.placement.spread if self.placement.count > 1 else None
+        found = self.folder.restore(tree, step, put)
         if found is not None:
-            self.state, self.sums = found[0]["agent"], found[0]["sums"]
+            self.state = self.population.without_padding(found[0]["agent"])
+            self.sums = found[0]["sums"]
             self.counters = Counters(**found[1])
-        self._healthy = np.array(self.state.healthy)
+        self._healthy = np.array(self.placement.own(self.state.healthy))
 
     def save(self) -> None:
         """Writes a checkpoint of everything that a resumed run needs."""
-        tree = {"agent": self.state, "sums": self.sums}
+        tree = self.placement.own({"agent": self.state, "sums": self.sums})
         self.folder.save(self._step(), tree, dataclasses.asdict(self.counters))
 
     def _step(self) -> int:
@@ -204,8 +226,9 @@ class Run:
             self._progress_bar() as self._bar,
             StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
-            if self._replay_note:
-                self._bar.message(self._replay_note)
+            for note in (self._devices_note(), self._replay_note):
+                if note:
+                    self._bar.message(note)
             if self.checkpoints.latest() is None:
                 self.save()
             saved_steps = schedule.environment_steps(self.counters.rounds)
@@ -238,6 +261,10 @@ class Run:
         """Closes the folder. The environment belongs to the caller."""
         self.folder.close()
 
+    def _devices_note(self) -> str:
+        """What devices are used, where there is a choice."""
+        return str(self.placement) if self.placement.available > 1 else ""
+
     def _progress_bar(self) -> Progress:
         return Progress(
             total_env_steps=self.schedule.environment_steps(self.schedule.rounds),
@@ -267,18 +294,8 @@ class Run:
         if hasattr(self.env, "rest"):
             # A frozen member learns nothing from what it would play.
             self.env.rest(np.repeat(~self._healthy, len(self.tasks)))
-        records = collect(
-            self.agent,
-            self.env,
-            self.state.params,
-            self.seeds,
-            self.state.updates,
-            jnp.int32(phase),
-            tasks=len(self.tasks),
-            ticks=self.schedule.config.phase_ticks,
-            mode=mode,
-        )
-        records = to_host(records)
+        records = to_host(self.population.collect(self.state, phase, mode))
+        records = self.placement.own(records)
         self.env.check()
         check_records(records, self.tasks, self._healthy)
         self._time("evaluate" if mode == "evaluate" else "collect", started)
@@ -338,26 +355,19 @@ class Run:
     def _update(self, stop: StopRequest) -> None:
         """Makes the updates that are due, or those until a stop is requested."""
         self._bar.update(phase="updating")
-        learning, schedule = self.agent.config.learning, self.schedule.config
+        learning = self.agent.config.learning
         due = self.schedule.updates_due(self.counters.rounds)
         started, before = time.perf_counter(), self.counters.updates
         loss: jax.Array | None = None
         with self.replay.batches(
-            np.asarray(self.seeds).tolist(),
+            self.population.own_seeds,
             range(before, due),
             learning.batch_size,
             learning.sequence_length,
         ) as batches:
             for update, batch in enumerate(batches, start=before):
                 previous = loss
-                self.state, self.sums, loss = update_members(
-                    self.agent,
-                    self.state,
-                    self.sums,
-                    batch,
-                    mapping=schedule.mapping,
-                    chunk=schedule.mapping_chunk,
-                )
+                self.state, self.sums, loss = self.population.update(self.state, self.sums, batch)
                 # One update ahead of the device, no more: the next batch is being prepared.
                 jax.block_until_ready(previous)
                 self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
@@ -371,8 +381,9 @@ class Run:
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
-        newly_frozen = np.flatnonzero(self._healthy & ~np.asarray(self.state.healthy)).tolist()
-        self._healthy = np.array(self.state.healthy)
+        healthy = np.array(self.placement.own(self.state.healthy))
+        newly_frozen = np.flatnonzero(self._healthy & ~healthy).tolist()
+        self._healthy = healthy
         for member in range(len(self.members)):
             averages = {name: float(x[member]) / count for name, x in sums.items()}
             row = {"kind": "update", **self._columns(member, self.counters.rounds), **averages}
@@ -411,8 +422,7 @@ class Run:
         self._bar.update(phase="evaluating")
         index = self.counters.evaluations + 1
         records = self._phase("evaluate", index)
-        found = diagnose(self.agent, self.state.params, records, self.seeds, jnp.int32(index))
-        diagnosis = jax.device_get(found)
+        diagnosis = jax.device_get(self.population.diagnose(self.state.params, records, index))
         scores = []
         for member, task in np.ndindex(len(self.members), len(self.tasks)):
             healthy, episode = bool(self._healthy[member]), episodes(records.at(member, task))[0]

@@ -91,12 +91,14 @@ class Env(Protocol):
       discrete: True if actions are one-hot vectors of length A; False for continuous ones.
       has_host: False if all of it is part of the jitted program; True if anything, simulators or
         renderers, runs on the host.
+      shards: how many programs, one for each device, play it at once, each with members of its own.
     """
 
     action_size: int
     image_size: int
     discrete: bool
     has_host: bool
+    shards: int
 
     def reset(self, slot: Any, key: Any) -> tuple[Any, TimeStep]:
         """Put a new simulator, seeded by `key`, into `slot` (int32 []).

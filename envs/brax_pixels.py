@@ -29,6 +29,7 @@ from envs.rows import (
     check_slots,
     key_words,
     mapped_rows,
+    members_of_shard,
 )
 
 
@@ -63,6 +64,7 @@ class BraxEnv:
       action_repeat: environment steps for which an action is held.
       action_size: A, at least the largest |A| of the tasks.
       workers, timeout: not used.
+      shards: how many programs play them at once, see `envs.bridge.HostEnv`.
 
     Raises:
       ValueError: for an image size that is too small.
@@ -80,10 +82,12 @@ class BraxEnv:
         action_size: int,
         workers: int | None = None,
         timeout: float = SIMULATOR_TIMEOUT,
+        shards: int = 1,
     ):
         self.tasks = tuple(tasks)
         check_size(image_size, self.tasks[0].supersample)
-        self.members = members
+        self.members, self.shards = members, shards
+        self._together = members_of_shard(members, shards)
         self.image_size = image_size
         self.action_repeat = action_repeat
         self.action_size = action_size
@@ -155,7 +159,7 @@ class BraxEnv:
         return state, TimeStep(images, jnp.where(bad, jnp.nan, rewards), ended, terminal)
 
     def _by_task(self, functions, slots, rows):
-        return apply_by_group(functions, range(len(self.tasks)), self.members, slots, rows)
+        return apply_by_group(functions, range(len(self.tasks)), self._together, slots, rows)
 
     # Traced once for each number of rows, however many mappings are traced above it.
     @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -192,9 +196,12 @@ class BraxEnv:
     def _images(self, slots, views, actions) -> tuple[jax.Array, jax.Array]:
         """Images of views, and which of them come of what cannot be simulated."""
         bad = ~jnp.isfinite(actions).all(axis=1)
-        if len(slots) == self.members * len(self.tasks):
+        if len(slots) == self._together * len(self.tasks):
             # Tasks were told apart by the order of the slots.
-            bad |= (jnp.sort(slots) != jnp.arange(len(slots))).any()
+            expected = jnp.arange(len(slots))
+            if self.shards > 1:
+                expected += slots.min() // len(slots) * len(slots)
+            bad |= (jnp.sort(slots) != expected).any()
         return views, bad
 
 
@@ -205,6 +212,7 @@ class HostDrawnBraxEnv(BraxEnv):
       tasks, members, image_size, action_repeat, action_size: as of `BraxEnv`.
       workers: number of processes that draw, by default min(cores, slots).
       timeout: seconds after which one that does not answer is given up.
+      shards: how many programs play them at once, see `envs.bridge.HostEnv`.
 
     Raises:
       ValueError: for an image size that is too small.
@@ -222,8 +230,9 @@ class HostDrawnBraxEnv(BraxEnv):
         action_size: int,
         workers: int | None = None,
         timeout: float = SIMULATOR_TIMEOUT,
+        shards: int = 1,
     ):
-        super().__init__(tasks, members, image_size, action_repeat, action_size)
+        super().__init__(tasks, members, image_size, action_repeat, action_size, shards=shards)
         self._positions = max(physics.positions for physics in self._physics)
         self._calls = HostCalls()
         self._pool = SimulatorPool(
@@ -233,6 +242,7 @@ class HostDrawnBraxEnv(BraxEnv):
             1,
             workers,
             timeout,
+            self._together * len(self.tasks),
         )
         slots = np.arange(members * len(self.tasks))
         self._pool.reset(slots, np.zeros((len(slots), 1), np.uint32))
@@ -273,14 +283,20 @@ class HostDrawnBraxEnv(BraxEnv):
     def _host_draw(self, rows: np.ndarray) -> np.ndarray:
         slots, bad, positions = rows[:, 0], rows[:, 1] != 0, rows[:, 2:].view(np.float32)
         try:
-            check_slots(slots, self.members, len(self.tasks))
+            check_slots(slots, self.shards * self._together, len(self.tasks))
         except ValueError as error:
             raise SimulatorError(str(error)) from None
         if bad.any():
             slot = slots[bad][0]
             name = self.tasks[slot % len(self.tasks)].name
             raise SimulatorError(f"slot {slot} ({name}) got an action that is not finite")
-        return self._pool.step(slots, positions).image
+        drawn = slots < self.members * len(self.tasks)
+        if drawn.all():
+            return self._pool.step(slots, positions).image
+        # What makes up the members of the last shard is looked at by nobody.
+        images = np.zeros((len(slots), self.image_size, self.image_size, 3), np.uint8)
+        images[drawn] = self._pool.step(slots[drawn], positions[drawn]).image
+        return images
 
 
 def _phase_key(words: jax.Array) -> jax.Array:

@@ -19,7 +19,7 @@ from jax.experimental import io_callback
 
 from envs.base import SIMULATOR_TIMEOUT, SimulatorError, TaskSpec, TimeStep
 from envs.pool import SimulatorPool
-from envs.rows import action_words, check_slots, key_words, mapped_rows
+from envs.rows import action_words, check_slots, key_words, mapped_rows, members_of_shard
 
 
 class Token(NamedTuple):
@@ -101,6 +101,8 @@ class HostEnv:
       action_size: A, at least the largest |A| of the tasks.
       workers: number of worker processes, by default min(cores, slots).
       timeout: seconds after which a simulator that does not answer is given up.
+      shards: how many programs play it at once, each P / shards members, rounded up: the
+        first so many, the next, and so on. Slots beyond P * K rest always.
     """
 
     has_host = True
@@ -114,18 +116,20 @@ class HostEnv:
         action_size: int,
         workers: int | None = None,
         timeout: float = SIMULATOR_TIMEOUT,
+        shards: int = 1,
     ):
         self.tasks = tuple(tasks)
-        self.members = members
+        self.members, self.shards = members, shards
         self.image_size = image_size
         self.action_repeat = action_repeat
         self.action_size = action_size
         self.discrete = self.tasks[0].discrete
         self._calls = HostCalls()
-        self._ticks = np.full(members * len(self.tasks), -1, np.int32)
-        self._resting = np.zeros(members * len(self.tasks), bool)
+        share = members_of_shard(members, shards) * len(self.tasks)
+        self._ticks = np.full(share * shards, -1, np.int32)
+        self._resting = np.arange(share * shards) >= members * len(self.tasks)
         self._pool = SimulatorPool(
-            self.tasks * members, image_size, action_size, action_repeat, workers, timeout
+            self.tasks * members, image_size, action_size, action_repeat, workers, timeout, share
         )
         results = (
             jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
@@ -154,14 +158,14 @@ class HostEnv:
         Args:
           slots: bool [P * K]; those that are False are simulated from their next reset on.
         """
-        slots = np.asarray(slots, bool)
-        if slots.shape != self._resting.shape:
+        slots, count = np.asarray(slots, bool), self.members * len(self.tasks)
+        if slots.shape != (count,):
             raise ValueError(
-                f"got a mask of {slots.shape} slots, expected {self._resting.shape} "
+                f"got a mask of {slots.shape} slots, expected {(count,)} "
                 f"({self.members} members x {len(self.tasks)} tasks)"
             )
         jax.effects_barrier()
-        self._resting = slots.copy()
+        self._resting = np.concatenate([slots, np.ones(len(self._resting) - count, bool)])
 
     def check(self) -> None:
         """Wait for callbacks under way and raise the error that one of them met, if any.
@@ -228,10 +232,11 @@ class HostEnv:
         return ticks
 
     def _name(self, slot: int) -> str:
-        return f"slot {slot} ({self._pool.tasks[slot].name})"
+        return f"slot {slot} ({self.tasks[slot % len(self.tasks)].name})"
 
     def _check_slots(self, slots: np.ndarray) -> None:
         try:
-            check_slots(slots, self.members, len(self.tasks))
+            members = self.shards * members_of_shard(self.members, self.shards)
+            check_slots(slots, members, len(self.tasks))
         except ValueError as error:
             raise SimulatorError(str(error)) from None

@@ -13,7 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Env, TimeStep
-from envs.rows import Layout, action_words, apply_by_group, key_words, mapped_rows
+from envs.rows import (
+    Layout,
+    action_words,
+    apply_by_group,
+    key_words,
+    mapped_rows,
+    members_of_shard,
+)
 
 
 class MixedState(NamedTuple):
@@ -35,13 +42,20 @@ class MixedEnv:
       parts: the environments, of images and actions of one size.
       places: for each of them, which of the K tasks its own tasks are.
       members: P.
+      shards: how many programs play them at once, see `envs.bridge.HostEnv`.
     """
 
     discrete = False
 
-    def __init__(self, parts: Sequence[Env], places: Sequence[Sequence[int]], members: int):
+    def __init__(
+        self,
+        parts: Sequence[Env],
+        places: Sequence[Sequence[int]],
+        members: int,
+        shards: int = 1,
+    ):
         self.parts = tuple(parts)
-        self.members = members
+        self.shards, self._together = shards, members_of_shard(members, shards)
         self.image_size, self.action_size = parts[0].image_size, parts[0].action_size
         self.has_host = any(part.has_host for part in parts)
         self._tasks = sum(map(len, places))
@@ -70,7 +84,7 @@ class MixedEnv:
 
     def rest(self, slots: np.ndarray) -> None:
         """Let slots idle (bool [P * K]) in the environments whose simulators can."""
-        by_task = np.asarray(slots, bool).reshape(self.members, self._tasks)
+        by_task = np.asarray(slots, bool).reshape(-1, self._tasks)
         for part, places in zip(self.parts, self._places, strict=True):
             if hasattr(part, "rest"):
                 part.rest(by_task[:, places].reshape(-1))
@@ -102,7 +116,7 @@ class MixedEnv:
             for index in range(len(self.parts))
         ]
         slots = rows[:, 0]
-        states, time_step = apply_by_group(functions, self._part_of, self.members, slots, rows)
+        states, time_step = apply_by_group(functions, self._part_of, self._together, slots, rows)
         return MixedState(slots, states), time_step
 
     def _reset_rows(self, rows: jax.Array) -> tuple[MixedState, TimeStep]:

@@ -8,6 +8,7 @@ platform likes, while a fork after JAX has started its threads can deadlock. POS
 
 from __future__ import annotations
 
+import itertools
 import mmap
 import os
 import signal
@@ -93,6 +94,9 @@ class SimulatorPool:
       workers: number of processes; by default one for each core, and never more than slots.
       timeout: seconds after which a simulator that does not answer is taken for stuck, and its
         process ended.
+      share: where several threads ask at once, how many slots each asks for: the first so many,
+        the next, and so on. Each has processes of its own, if there are enough; else they take
+        turns. By default one thread asks for all.
 
     Raises:
       ModuleNotFoundError: if the simulators' package is not installed.
@@ -107,19 +111,32 @@ class SimulatorPool:
         action_repeat: int,
         workers: int | None = None,
         timeout: float = SIMULATOR_TIMEOUT,
+        share: int | None = None,
     ):
         self._timeout, self._hurried = timeout, False
         self.tasks = tuple(tasks)
         slots = len(self.tasks)
         count = min(workers or available_cores(), slots)
-        # Slots of one task go to different workers, for tasks differ in cost.
-        by_task = sorted(range(slots), key=lambda slot: self.tasks[slot].name)
-        self._worker_of = {slot: index % count for index, slot in enumerate(by_task)}
+        self._share = share or slots
+        groups = min(-(-slots // self._share), count)
+        self._locks = [threading.Lock() for _ in range(groups)]
+        self._worker_of: dict[int, int] = {}
+        first = 0
+        for group in range(groups):
+            chosen = [slot for slot in range(slots) if self._group(slot) == group]
+            own = min(len(range(group, count, groups)), len(chosen))
+            # Slots of one task go to different workers, for tasks differ in cost.
+            by_task = sorted(chosen, key=lambda slot: self.tasks[slot].name)
+            self._worker_of |= {slot: first + i % own for i, slot in enumerate(by_task)}
+            first += own
+        count = first
 
-        # With a core to spare, the pool waits awake, as its workers do.
-        self._active_wait = ACTIVE_WAIT if count < available_cores() else 0.0
+        # With a core to spare, the pool waits awake, as its workers do; several threads would keep
+        # one another from it.
+        spare = count < available_cores() and groups == 1
+        self._active_wait = ACTIVE_WAIT if spare else 0.0
         layout = record_type(action_size, image_size)
-        self._request_number = 0
+        self._request_numbers = itertools.count(1)
         self._workers: list[_Worker] = []
         self._finalizer = weakref.finalize(self, _stop, self._workers)
         with _shared_file(slots * layout.itemsize) as file:
@@ -136,7 +153,7 @@ class SimulatorPool:
         try:
             starting = max(timeout, _START)
             started: dict[int, list[int]] = {index: [] for index in range(count)}
-            if failures := self._replies(started, starting, patience=_SLOW_START):
+            if failures := self._replies(0, started, starting, patience=_SLOW_START):
                 raise self._start_error(min(failures))
         except BaseException:
             self.close()
@@ -159,10 +176,17 @@ class SimulatorPool:
         self._records["action"][slots] = actions
         return self._request("step", slots, [None] * len(slots))
 
+    def _group(self, slot: int) -> int:
+        """Which of the groups of workers has a slot."""
+        return int(slot) // self._share % len(self._locks)
+
     def _request(self, command: str, slots: np.ndarray, arguments: list) -> TimeStep:
         if not self._finalizer.alive:
             raise SimulatorError("the environment was closed, make a new one")
-        self._request_number += 1
+        with self._locks[self._group(slots[0])]:
+            return self._answer(next(self._request_numbers), command, slots, arguments)
+
+    def _answer(self, number: int, command: str, slots: np.ndarray, arguments: list) -> TimeStep:
         shares: dict[int, tuple[list, list]] = {}
         for slot, argument in zip(slots.tolist(), arguments, strict=True):
             share = shares.setdefault(self._worker_of[slot], ([], []))
@@ -171,9 +195,9 @@ class SimulatorPool:
         for index, share in shares.items():
             # A process that is dead is noticed when its reply is waited for.
             with suppress(ConnectionError):
-                self._workers[index].connection.send((self._request_number, command, *share))
+                self._workers[index].connection.send((number, command, *share))
         asked = {index: share[0] for index, share in shares.items()}
-        if failures := self._replies(asked, self._timeout):
+        if failures := self._replies(number, asked, self._timeout):
             slot, problem = min(failures)  # of the lowest slot, whoever was first
             raise SimulatorError(
                 f"The simulator of slot {slot}, {self.tasks[slot].name}, failed {problem}"
@@ -197,7 +221,11 @@ class SimulatorPool:
         self._hurried = True
 
     def _replies(
-        self, asked: Mapping[int, list[int]], timeout: float, patience: float | None = None
+        self,
+        request: int,
+        asked: Mapping[int, list[int]],
+        timeout: float,
+        patience: float | None = None,
     ) -> list:
         """Wait for replies; returns the failures that they report.
 
@@ -205,6 +233,7 @@ class SimulatorPool:
         was interrupted, are passed over.
 
         Args:
+          request: its number.
           asked: of each worker asked, the slots, in the order in which it does them.
           timeout: seconds for which to wait.
           patience: seconds after which to warn first, by default a few.
@@ -223,7 +252,7 @@ class SimulatorPool:
                 try:
                     if connection.poll():
                         number, failure = connection.recv()
-                        if number == self._request_number:
+                        if number == request:
                             del pending[connection]
                             if failure is not None:
                                 failures.append(failure)
@@ -239,12 +268,13 @@ class SimulatorPool:
                 limit, why = timeout, ""
             if seconds > limit:
                 for index in pending.values():
-                    worker, slot = self._workers[index], self._busy_slot(index, asked[index])
+                    worker = self._workers[index]
+                    slot = self._busy_slot(index, asked[index], request)
                     error = worker.stuck(slot, seconds, why)
                 pending = {}
             elif pending and seconds > warned:
                 index = next(iter(pending.values()))
-                slot = self._busy_slot(index, asked[index])
+                slot = self._busy_slot(index, asked[index], request)
                 warnings.warn(
                     f"the simulator of slot {slot}, {self.tasks[slot].name}, has not answered for "
                     f"{warned:.0f} seconds (process {self._workers[index].process.pid}); it is "
@@ -256,9 +286,9 @@ class SimulatorPool:
             raise error
         return failures
 
-    def _busy_slot(self, index: int, slots: list[int]) -> int:
+    def _busy_slot(self, index: int, slots: list[int], request: int) -> int:
         """Which of the slots a worker was asked for it has not done yet."""
-        left = [s for s in slots if self._records["answered"][s] != self._request_number]
+        left = [s for s in slots if self._records["answered"][s] != request]
         return (left or slots or list(self._workers[index].tasks))[0]
 
     def close(self) -> None:

@@ -226,6 +226,7 @@ def make(
     action_size: int | None = None,
     supersample: int = 1,
     timeout: float = SIMULATOR_TIMEOUT,
+    shards: int = 1,
 ) -> Env:
     """The environment of a population: P = `members` simulators of each of K = len(tasks) tasks.
 
@@ -240,6 +241,9 @@ def make(
         the jumps of edges from pixel to pixel into shades; 1 draws them as they are.
       timeout: seconds after which a simulator process that does not answer is ended, as one that
         died by itself.
+      shards: how many programs play it at once, at most P: the first those of the first
+        P / shards members, rounded up, the next those of as many that follow, and so on. Slots
+        that are then beyond P * K may be played, but nothing is simulated in them.
 
     Raises:
       ValueError: for an unknown task or a number that is too small.
@@ -255,6 +259,7 @@ def make(
         image_size=image_size,
         action_repeat=action_repeat,
         supersample=supersample,
+        shards=shards,
     )
     if workers is not None:
         numbers["workers"] = workers
@@ -278,7 +283,7 @@ def make(
             make_env = pkgutil.resolve_name(maker)
             part = [known[k] for k in chosen]
             size = action_size or largest
-            options = {"workers": workers, "timeout": timeout}
+            options = {"workers": workers, "timeout": timeout, "shards": shards}
             parts.append(make_env(part, members, image_size, action_repeat, size, **options))
     except BaseException:
         for part in parts:
@@ -286,7 +291,9 @@ def make(
         raise
     if len(parts) == 1:
         return parts[0]
-    return pkgutil.resolve_name("envs.mixed:MixedEnv")(parts, list(places.values()), members)
+    return pkgutil.resolve_name("envs.mixed:MixedEnv")(
+        parts, list(places.values()), members, shards
+    )
 
 
 def register_gymnasium() -> None:

@@ -55,6 +55,11 @@ def action_words(state: Any, action: jax.Array, action_size: int) -> jax.Array:
     return words(*jax.tree.leaves(state), jnp.asarray(action, jnp.float32))
 
 
+def members_of_shard(members: int, shards: int) -> int:
+    """How many of P members each of several programs plays, the last one perhaps fewer."""
+    return -(-members // shards)
+
+
 def check_slots(slots: np.ndarray, members: int, tasks: int) -> None:
     """Raise a ValueError unless `slots` are some of the P * K, each at most once."""
     count = members * tasks
@@ -132,7 +137,7 @@ def apply_by_group(
     Args:
       functions: one for each group, leaves [m, ...] -> leaves [m, ...], all of the same types.
       groups: K, the group of each task.
-      members: P.
+      members: P, of those that one program plays.
       slots: int32 [n], member * K + task.
       rows: leaves [n, ...].
 

@@ -36,6 +36,7 @@ import envs
 from dreamer_jax import config as configs
 from dreamer_jax.agent import Agent, Carry
 from dreamer_jax.config import Config
+from dreamer_jax.devices import Choice
 from dreamer_jax.randomness import acting_key
 from envs.pixel_env import PixelEnv
 from experiments import methods
@@ -156,6 +157,7 @@ def train(
     preset: str = "cpu",
     out: str | Path | None = None,
     workers: int | None = None,
+    devices: Choice = "all",
     **settings: Any,
 ) -> Trained:
     """Trains agents from scratch, one per seed, as one population.
@@ -166,6 +168,7 @@ def train(
       preset: settings to start from, see `dreamer_jax.config`.
       out: the results folder; by default one of its own in runs/.
       workers: simulator processes; by default one per core.
+      devices: how many to spread the agents over, each agent on one of them.
       settings: others than the preset's, by name, such as environment_steps=20_000.
 
     Raises:
@@ -173,7 +176,7 @@ def train(
       KeyboardInterrupt: stopped by Ctrl-C, and saved: the same call goes on.
     """
     config = _with(configs.preset(preset), settings)
-    return _run(RunSpec(_several(task, str), _several(seeds, int), config), out, workers)
+    return _run(RunSpec(_several(task, str), _several(seeds, int), config), out, workers, devices)
 
 
 def transfer(
@@ -184,6 +187,7 @@ def transfer(
     seeds: int | Sequence[int] = 0,
     out: str | Path | None = None,
     workers: int | None = None,
+    devices: Choice = "all",
     **settings: Any,
 ) -> Trained:
     """Trains targets that begin with what a source knows.
@@ -194,7 +198,7 @@ def transfer(
       task: as for `train`.
       method: one of `experiments.methods.known()`, such as "fine-tuning".
       seeds: of the targets, one for each seed and each variant of the method.
-      out, workers: as for `train`.
+      out, workers, devices: as for `train`.
       settings: of the method, such as omegas=(0.0, 0.2), and of the agents where they are to differ
         from the source's.
 
@@ -212,7 +216,8 @@ def transfer(
         own["reward_sources"] = tuple(map(_folder, own["reward_sources"]))
     made = methods.make(method, {"sources": names, **own})
     config = _with(load_source(names[0], made.source_member).spec.config, settings)
-    return _run(RunSpec(_several(task, str), _several(seeds, int), config, made), out, workers)
+    spec = RunSpec(_several(task, str), _several(seeds, int), config, made)
+    return _run(spec, out, workers, devices)
 
 
 def evaluate(
@@ -271,10 +276,10 @@ def _with(config: Config, settings: Mapping[str, Any]) -> Config:
     return configs.from_dict(whole)
 
 
-def _run(spec: RunSpec, out: str | Path | None, workers: int | None) -> Trained:
+def _run(spec: RunSpec, out: str | Path | None, workers: int | None, devices: Choice) -> Trained:
     """Carries out a run, or what is left of it."""
     directory = RUNS / _name(spec) if out is None else Path(out)
-    run = make_run(spec, directory, resume=True, workers=workers)
+    run = make_run(spec, directory, resume=True, workers=workers, devices=devices)
     if carry_out(run) == "stopped":
         raise KeyboardInterrupt(f"stopped and saved in {directory}: the same call goes on")
     return Trained(directory, spec)

@@ -2,7 +2,7 @@
 
 import os
 
-from dreamer_jax import training
+from dreamer_jax import population
 
 QUICK_CODE = {"xla_backend_optimization_level": 2}
 """Options of `jax.jit` and of `compile`."""
@@ -12,7 +12,7 @@ if "xla_cpu_use_fusion_emitters" in os.environ["XLA_FLAGS"]:
 
 def update_with_quick_code(monkeypatch):
     """Lets runs compile their updates, the same ones, to quick code."""
-    original, compiled = training.update_members, {}
+    original, compiled = population.update_members, {}
 
     def update(agent, *arguments, **options):
         key = (agent, *options.items())
@@ -20,4 +20,4 @@ def update_with_quick_code(monkeypatch):
             compiled[key] = original.lower(agent, *arguments, **options).compile(QUICK_CODE)
         return compiled[key](*arguments)
 
-    monkeypatch.setattr(training, "update_members", update)
+    monkeypatch.setattr(population, "update_members", update)

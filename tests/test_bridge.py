@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,9 +35,9 @@ def fake(simulator: str, action_size: int = 2) -> TaskSpec:
 
 
 @contextmanager
-def env_of(*tasks: TaskSpec, members: int = 1, action_repeat: int = 1, workers: int = 1):
+def env_of(*tasks: TaskSpec, members: int = 1, action_repeat: int = 1, workers=1, **options):
     action_size = max(task.action_size for task in tasks)
-    env = HostEnv(tasks, members, 4, action_repeat, action_size, workers)
+    env = HostEnv(tasks, members, 4, action_repeat, action_size, workers, **options)
     try:
         yield env
     finally:
@@ -208,6 +209,60 @@ def test_a_subset_of_slots_leaves_the_others_where_they_were(population):
     _, time_step = step(state, jnp.zeros((6, 3)))
     population.check()
     assert steps_shown(time_step.image).tolist() == [1, 1, 3, 3, 1, 1]
+
+
+def test_of_several_programs_each_plays_its_own_members_and_what_is_beyond_them_rests():
+    """P = 3 members, 2 programs: members 0 and 1, and member 2 with one that is none."""
+    with env_of(fake("Counting"), members=3, workers=2, shards=2) as env:
+        for first in (0, 2):
+            slots = jnp.arange(first, first + 2)
+            keys = jax.random.split(KEY, 2)
+            state, _ = jax.vmap(env.reset)(slots, keys)
+            _, step = jax.vmap(env.step)(state, jnp.ones((2, 2)))
+            env.check()
+            assert step.reward.tolist() == [2.0, 2.0 if first == 0 else 0.0]
+            assert steps_shown(step.image).tolist() == [1, 1 if first == 0 else 0]
+        env.rest(np.array([True, False, False]))
+        with pytest.raises(ValueError, match=r"expected \(3,\) \(3 members x 1 tasks\)"):
+            env.rest(np.zeros(4, bool))
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_programs_have_workers_of_their_own_as_far_as_there_are_any(workers):
+    with env_of(fake("Counting"), fake("Falling"), members=5, workers=workers, shards=3) as env:
+        hosted = [set(worker.tasks) for worker in env._pool._workers]
+    assert len(hosted) == workers and set().union(*hosted) == set(range(10))
+    programs = [{slot // 4 for slot in slots} for slots in hosted]
+    assert max(len(of_one) for of_one in programs) == {1: 3, 2: 2, 5: 1}[workers]
+
+
+def test_no_worker_of_a_program_with_fewer_members_is_without_a_slot():
+    with env_of(fake("Counting"), members=7, workers=7, shards=3) as env:
+        hosted = [sorted(worker.tasks) for worker in env._pool._workers]
+    assert hosted == [[0], [1], [2], [3, 5], [4], [6]]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_programs_that_play_at_once_do_not_mix_up_replies(workers):
+    with env_of(fake("Counting"), members=4, workers=workers, shards=2) as env:
+        pool, seen = env._pool, {}
+
+        def play(program):
+            slots = np.arange(2 * program, 2 * program + 2)
+            pool.reset(slots, np.zeros((2, 2), np.uint32))
+            actions = np.full((2, 2), program, np.float32)
+            seen[program] = [pool.step(slots, actions) for _ in range(50)]
+
+        threads = [threading.Thread(target=play, args=(program,)) for program in (0, 1)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    for program in (0, 1):
+        assert [x.reward.tolist() for x in seen[program]] == [[2.0 * program] * 2] * 50
+        assert [steps_shown(x.image).tolist() for x in seen[program]] == [
+            [count, count] for count in range(1, 51)
+        ]
 
 
 def test_a_phase_depends_on_its_key_alone(population):

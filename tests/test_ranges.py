@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import io
 import math
+from typing import Literal
 
 import pytest
 from hypothesis import given, settings
@@ -129,6 +130,8 @@ def test_values_of_other_kinds_are_refused_too():
 class Example:
     share: tuple[float, ...] = setting((), 0, 1, above=True)
     count: int | None = setting(None, 1, 10)
+    devices: int | Literal["all"] = setting("all", 1, 10)
+    step: int | Literal["list"] | None = None
 
 
 def test_a_tuple_is_checked_entry_by_entry_and_none_may_be_left_out():
@@ -138,4 +141,11 @@ def test_a_tuple_is_checked_entry_by_entry_and_none_may_be_left_out():
         check_ranges(Example((0.5, 0)))
     with pytest.raises(ValueError, match="count is 11, is too large"):
         check_ranges(Example(count=11))
+    check_ranges(Example(devices=10, step=5))
+    check_ranges(Example(step="list"))
+    with pytest.raises(ValueError, match="devices is 0, must be positive"):
+        check_ranges(Example(devices=0))
+    for name, value in (("devices", "some"), ("step", "last"), ("step", 0.5)):
+        with pytest.raises(ValueError, match=f"{name} is {value!r}"):
+            check_ranges(Example(**{name: value}))
     assert 0.0 not in Range(0, 1, above=True) and 0.0 in Range(0, 1)

@@ -245,6 +245,25 @@ def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for
     assert (schedule.mapping, schedule.mapping_chunk) == expected
 
 
+def test_several_accelerators_work_at_once_and_each_has_memory_for_its_own(tmp_path, monkeypatch):
+    _, targets, *_ = plan(tmp_path)  # of 6 agents
+    one = SimpleNamespace(temp_size_in_bytes=10**6)
+    fixed = dataclasses.replace(SPEED, update_bytes=0, tick_seconds=dict.fromkeys(TASKS, 0.0))
+    alone = estimate.estimate(targets, fixed)
+    limit = (alone.memory / 2 + 2.5 * 10**6) / estimate.MEMORY_SHARE
+    device = SimpleNamespace(memory_stats=lambda: {"bytes_limit": limit})
+    monkeypatch.setattr(estimate.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(estimate.jax, "local_devices", lambda: [device, device])
+    monkeypatch.setattr(
+        estimate, "compiled_update", lambda _: SimpleNamespace(memory_analysis=lambda: one)
+    )
+    both = estimate.estimate(targets, fixed)
+    assert both.seconds == alone.seconds / 2 and both.memory == alone.memory // 2
+    assert estimate.estimate(targets, fixed, devices=1) == alone
+    # Of the 3 agents of each, 2 at once.
+    assert estimate.in_memory(targets.spec).config.schedule.mapping_chunk == 2
+
+
 def test_on_a_cpu_agents_are_updated_one_by_one_as_they_are(tmp_path):
     _, targets, *_ = plan(tmp_path)
     assert estimate.in_memory(targets.spec) == targets.spec

@@ -12,7 +12,7 @@ import pytest
 
 from compilation import update_with_quick_code
 from dreamer_jax import config as configs
-from dreamer_jax import training
+from dreamer_jax import population
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.logs import read_metrics
@@ -134,7 +134,7 @@ def test_members_of_one_population_do_not_influence_one_another(finished, tmp_pa
 
 def stop_after(run, actions):
     """Lets a run do some actions, then stop as a Ctrl-C in the midst of updates would."""
-    original, left = training.update_members, [actions]
+    original, left = population.update_members, [actions]
 
     def counting(*arguments, **options):
         left[0] -= 1
@@ -142,11 +142,11 @@ def stop_after(run, actions):
             signal.raise_signal(signal.SIGINT)
         return original(*arguments, **options)
 
-    training.update_members = counting
+    population.update_members = counting
     try:
         return run.train()
     finally:
-        training.update_members = original
+        population.update_members = original
         run.close()
 
 
@@ -169,7 +169,7 @@ class Killed(BaseException):
 
 def killing_after(updates):
     """What takes the place of `update_members` to kill a run after some updates."""
-    original, left = training.update_members, [updates]
+    original, left = population.update_members, [updates]
 
     def killing(*arguments, **options):
         left[0] -= 1
@@ -186,7 +186,7 @@ def test_a_run_killed_between_checkpoints_and_resumed_equals_one_that_was_not(
 ):
     directory, whole = finished
     run = run_in(tmp_path)
-    monkeypatch.setattr(training, "update_members", killing_after(updates))
+    monkeypatch.setattr(population, "update_members", killing_after(updates))
     with pytest.raises(Killed):
         run.train()
     run.close()
@@ -208,7 +208,7 @@ def test_a_run_that_deletes_old_records_and_is_killed_goes_on_as_if_it_had_not_b
 
     killed = run_in(tmp_path / "killed", **options)
     with monkeypatch.context() as patch:
-        patch.setattr(training, "update_members", killing_after(7))
+        patch.setattr(population, "update_members", killing_after(7))
         with pytest.raises(Killed):
             killed.train()
     killed.close()
@@ -248,7 +248,7 @@ def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_withou
     finished, tmp_path, capsys, monkeypatch
 ):
     directory, whole = finished
-    original, updates, rested = training.update_members, [], []
+    original, updates, rested = population.update_members, [], []
     monkeypatch.setattr(Probe, "rest", lambda self, slots: rested.append(slots.tolist()), False)
 
     def poisoning(agent, state, sums, batch, **options):
@@ -259,7 +259,7 @@ def test_a_member_that_turns_not_finite_is_named_and_the_others_finish_as_withou
             batch = batch._replace(reward=reward)
         return original(agent, state, sums, batch, **options)
 
-    monkeypatch.setattr(training, "update_members", poisoning)
+    monkeypatch.setattr(population, "update_members", poisoning)
     run, outcome = trained(tmp_path)
     assert outcome == "finished" and len(updates) == 8
     message = " ".join(capsys.readouterr().out.split())

@@ -13,7 +13,7 @@ import tyro
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import STOPPED, usage_errors
-from experiments.cli.options import Simulators
+from experiments.cli.options import Devices, Simulators
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Demo:
     """Of the targets, and of the agents from scratch."""
     preset: Literal["demo", "cpu", "debug"] = "demo"
     """Settings; debug runs in seconds, from a source of its own sizes."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread the agents over, each agent on one of them."""
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
 
 
@@ -57,7 +59,9 @@ def demo(command: Demo) -> int:
         spec = RunSpec(
             (command.task,), command.seeds, configs.preset(command.preset), method=method
         )
-        run = make_run(spec, folder, resume=True, workers=workers, timeout=timeout)
+        run = make_run(
+            spec, folder, resume=True, workers=workers, timeout=timeout, devices=command.devices
+        )
     if carry_out(run) == "stopped":
         print(f"stopped and saved in {folder}: the same command goes on")
         return STOPPED

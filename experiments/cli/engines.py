@@ -12,7 +12,7 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
-from experiments.cli.options import Simulators
+from experiments.cli.options import Devices, Simulators
 
 if TYPE_CHECKING:
     from experiments.thesis.engines import Engine
@@ -30,8 +30,8 @@ class Execution:
     run: str | None = None
     """Train only this one of the runs that `plan` shows, and make nothing of it."""
     gpus: float | None = setting(None, 0, 64)
-    """ray, slurm: accelerators of each run, or a part of one on Ray. By default one on Ray, if the
-    cluster has any, and none is asked of Slurm."""
+    """ray, slurm: accelerators of each run, over which its members are spread, or a part of one on
+    Ray. By default one on Ray, if the cluster has any, and none is asked of Slurm."""
     cpus: int = setting(1, 1, 1024)
     """ray, slurm: cores of each run, and simulator processes where --workers does not say."""
     memory: float | None = setting(None, 0, 65_536, above=True)
@@ -56,6 +56,8 @@ class Work:
 
     results: tyro.conf.Positional[Path]
     """The folder that holds the runs, such as results/cpu."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread members over, each member on one of them."""
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
@@ -153,15 +155,19 @@ def work(command: Work) -> int:
             raise ValueError(
                 f"there is no folder {command.results}: table, figure or sweep make it as they plan"
             )
+    from dreamer_jax.devices import check_devices
     from dreamer_jax.host_memory import keep_freed_memory
     from experiments.thesis import sweep
 
+    with usage_errors():
+        check_devices(command.devices)
     keep_freed_memory()
     progress = sweep.work(
         command.results,
         workers=command.simulators.workers,
         accept_failed=command.accept_failed,
         timeout=command.simulators.simulator_timeout,
+        devices=command.devices,
     )
     if progress.stopped:
         print("stopped and saved: the same command goes on")

@@ -25,6 +25,9 @@ from experiments.thesis import grid
 Preset = Literal["thesis", "cpu", "demo", "debug"]
 DEFAULT_PRESET: Preset = "cpu"
 
+Devices = int | Literal["all"]
+"""The option --devices."""
+
 _NUMBER = re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 ConfigFile = Annotated[Path | None, tyro.conf.arg(name="config")]

@@ -23,6 +23,7 @@ from experiments.cli.options import (
     DEFAULT_PRESET,
     Base,
     ConfigFile,
+    Devices,
     Preset,
     Simulators,
     make_method,
@@ -56,6 +57,9 @@ class Run:
     lists what there is."""
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread members over, each member on one of them. How many is no part of what a run
+    is: it goes on with more or fewer."""
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
@@ -218,6 +222,7 @@ def train(command: Train) -> int:
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.simulators.workers,
+            devices=run.devices,
             accept_failed=run.accept_failed,
             timeout=run.simulators.simulator_timeout,
             from_checkpoint=run.from_checkpoint,

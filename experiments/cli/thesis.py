@@ -29,6 +29,7 @@ from experiments.cli.options import (
     Base,
     Compared,
     ConfigFile,
+    Devices,
     Preset,
     Simulators,
     sequence,
@@ -62,6 +63,9 @@ class Sweep:
     fractional transfer."""
     results: Path = Path("results")
     """The folder of all results."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread members over, each member on one of them. How many is no part of what a run
+    is: it goes on with more or fewer."""
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     yes: bool = False
     """At a terminal: begin without a question, however long it takes."""
@@ -248,11 +252,13 @@ def _cells(entries: Sequence[Table | Figure], sweep: Sweep) -> list[grid.Cell]:
 
 def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
     """The runs behind tables and figures, beside what others are at; nothing is reserved."""
+    from dreamer_jax.devices import check_devices
     from experiments.thesis.graph import plan_runs
     from experiments.thesis.reservations import standing
 
     cells = _cells(entries, sweep)
     with usage_errors():
+        check_devices(sweep.devices)
         return plan_runs(cells, sweep.config, sweep.root, standing(sweep.root))
 
 
@@ -267,6 +273,7 @@ def _carry_out(
     Raises:
       UsageError: results of other settings are there, or a simulator or an engine is not installed.
     """
+    from dreamer_jax.devices import check_devices
     from dreamer_jax.host_memory import keep_freed_memory
     from experiments.thesis.graph import due
     from experiments.thesis.reservations import planned
@@ -276,6 +283,8 @@ def _carry_out(
     with contextlib.ExitStack() as at_work:
         with usage_errors():
             check_execution(execution)
+            if execution.executor == "local":  # elsewhere, there are those of each run
+                check_devices(sweep.devices)
             runs = at_work.enter_context(planned(cells, sweep.config, sweep.root))
             wanted = chosen_run(runs, execution.run)
             if execution.executor == "local" and due(wanted):
@@ -285,6 +294,7 @@ def _carry_out(
                 sweep.root,
                 **engine_options(execution, wanted, sweep.simulators),
                 accept_failed=sweep.accept_failed,
+                devices=sweep.devices,
             )
     if progress.stopped and not progress.left:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
@@ -308,7 +318,7 @@ def plan(command: Plan) -> int:
         return 0
     known = _speed(left, timeout, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
-    print(estimate.plan_table(runs, known and known.speed))
+    print(estimate.plan_table(runs, known and known.speed, sweep.devices))
     if known is not None:
         ticks = 1000 * max(known.speed.tick_seconds.values())
         when = f"kept in {known.path} (--measure measures anew)" if known.kept else "here and now"
@@ -331,7 +341,7 @@ def _as_json(runs: "Graph", sweep: Sweep) -> dict[str, object]:
     from experiments.thesis.graph import PlannedRun
     from experiments.thesis.speeds import cache_folder
 
-    known = estimates(runs, cache_folder())
+    known = estimates(runs, cache_folder(), sweep.devices)
     found = []
     for run in runs:
         one = known.get(run.name)
@@ -367,7 +377,7 @@ def _speed(left: "Sequence[PlannedRun]", timeout: float, again: bool = False) ->
     return speed_of(specs, cache_folder(), again=again, timeout=timeout, report=report)
 
 
-def _may_begin(runs: "Graph", timeout: float) -> bool:
+def _may_begin(runs: "Graph", timeout: float, devices: Devices) -> bool:
     """Asks before anything longer than an hour. Runs of few updates are short without measuring."""
     from dreamer_jax.schedule import Schedule
     from experiments.thesis import estimate
@@ -382,7 +392,7 @@ def _may_begin(runs: "Graph", timeout: float) -> bool:
     if updates < LONG_SECONDS:
         return True
     speed = _speed(left, timeout).speed
-    total = estimate.together(runs, speed)
+    total = estimate.together(runs, speed, devices)
     if total.seconds < LONG_SECONDS:
         return True
     agents = sum(len(run.cells) for run in left)
@@ -406,7 +416,7 @@ def _begins(entries: Sequence[Table | Figure], sweep: Sweep, execution: Executio
     runs = _planned(entries, sweep)
     with usage_errors():
         wanted = chosen_run(runs, execution.run)
-    if _may_begin(wanted, sweep.simulators.simulator_timeout):
+    if _may_begin(wanted, sweep.simulators.simulator_timeout, sweep.devices):
         return True
     print("nothing was begun")
     return False

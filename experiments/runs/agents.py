@@ -37,9 +37,12 @@ def make_agent(spec: RunSpec) -> Agent:
 
 
 def make_env(
-    spec: RunSpec, workers: int | None = None, timeout: float = envs.SIMULATOR_TIMEOUT
+    spec: RunSpec,
+    workers: int | None = None,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+    shards: int = 1,
 ) -> envs.Env:
-    """The simulators of a run: one for every member and task."""
+    """The simulators of a run: one for every member and task; `shards` devices play them."""
     return envs.make(
         spec.tasks,
         members=len(spec.members),
@@ -48,6 +51,7 @@ def make_env(
         workers=workers,
         supersample=spec.config.schedule.supersample,
         timeout=timeout,
+        shards=shards,
     )
 
 

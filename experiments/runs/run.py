@@ -20,6 +20,7 @@ import envs
 import transfer
 from dreamer_jax.checkpoint import Checkpointer
 from dreamer_jax.device_round import on_device
+from dreamer_jax.devices import Choice, place
 from dreamer_jax.integrity import DamagedError, write_sealed_json
 from dreamer_jax.locks import FolderLock
 from dreamer_jax.training import Run
@@ -68,6 +69,7 @@ def make_run(
     from_checkpoint: int | None = None,
     lock: FolderLock | None = None,
     cells: Sequence[str] = (),
+    devices: Choice = "all",
 ) -> Run:
     """Prepares a run: simulators, agents, and the results folder.
 
@@ -82,14 +84,17 @@ def make_run(
       from_checkpoint: step of an older checkpoint to go on from.
       lock: the folder's lock, if the caller holds it; released with the run, or when this raises.
       cells: names of the cells of the grid that the members are.
+      devices: how many to spread the members over.
 
     Raises:
       FolderInUseError: another process works in the folder.
       DamagedError: the folder lacks files, or holds others than were written.
-      ValueError: the folder holds another run, or a source does not fit.
+      ValueError: the folder holds another run, a source does not fit, or there are not so many
+        devices.
       FileExistsError: the folder holds a run, and `resume` is False.
     """
     directory = Path(directory)
+    placement = place(len(spec.members), devices)
     _check_folder(directory, spec, resume)
     # A new folder is made only when everything that may be wrong with the input has been looked at.
     if lock is None and directory.exists():
@@ -101,9 +106,9 @@ def make_run(
             sources = load_sources(spec, base, accept_failed=accept_failed)
             state, report = transferred_members(spec, sources, workers=workers, timeout=timeout)
         agent = make_agent(spec)
-        env = make_env(spec, workers=workers, timeout=timeout)
+        env = make_env(spec, workers=workers, timeout=timeout, shards=placement.count)
         # What cannot be had is refused before the folder is made.
-        on_device(agent, env.has_host, len(spec.tasks), len(spec.members))
+        on_device(agent, env.has_host, len(spec.tasks), placement.each)
         lock = lock or FolderLock(directory)
         _check_folder(directory, spec, resume)  # again, now that nobody else can change it
         if report is not None:
@@ -124,6 +129,7 @@ def make_run(
             resume=True,
             from_checkpoint=from_checkpoint,
             lock=lock,
+            placement=placement,
         )
     except BaseException:
         if lock is not None:

@@ -1,7 +1,8 @@
 """What runs will take: time, memory and disk, from a short measurement (`measurement`).
 
 An estimate: it takes one member's update and one simulator's tick, and multiplies. Members that
-are mapped at once on an accelerator take less time than that, and a busy machine more.
+are mapped at once on an accelerator take less time than that, and a busy machine more. Accelerators
+work beside one another, each for its own members; several devices of one processor do not.
 
 Axis letters: P population member, K task.
 """
@@ -18,6 +19,7 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.device_round import on_device, replay_bytes
+from dreamer_jax.devices import Choice, place
 from dreamer_jax.schedule import Schedule
 from experiments.runs.agents import make_agent
 from experiments.runs.spec import RunSpec, action_size
@@ -37,7 +39,7 @@ class Estimate:
 
     Attributes:
       seconds: to its end.
-      memory: bytes, at most.
+      memory: bytes, at most, of each device.
       disk: bytes, in the end.
     """
 
@@ -64,61 +66,65 @@ def _record_bytes(spec: RunSpec) -> int:
     return 3 * size * size + 4 * action_size(spec.tasks) + 4 + 2
 
 
-def _memory(spec: RunSpec, update_bytes: int, chunk: int) -> int:
-    """Bytes: states, two batches, one phase of records twice, and the updates of one chunk."""
+def _memory(spec: RunSpec, update_bytes: int, members: int, chunk: int) -> int:
+    """Bytes of some members: states, two batches, one phase of records twice, and the updates of
+    one chunk."""
     learning, schedule = spec.config.learning, spec.config.schedule
     records = learning.batch_size * learning.sequence_length
     records += (schedule.phase_ticks + 1) * len(spec.tasks)
     each = _member_bytes(make_agent(spec)) + 2 * records * _record_bytes(spec)
-    return len(spec.members) * each + chunk * update_bytes
+    return members * each + chunk * update_bytes
 
 
-def _chunk(spec: RunSpec) -> int:
-    """How many members an update maps at once."""
+def _chunk(spec: RunSpec, members: int) -> int:
+    """How many of the members of one device an update maps at once."""
     schedule = spec.config.schedule
     one_by_one = schedule.mapping == "auto" and jax.default_backend() == "cpu"
     if schedule.mapping == "chunks" or one_by_one:
-        return min(schedule.mapping_chunk, len(spec.members))
-    return len(spec.members)
+        return min(schedule.mapping_chunk, members)
+    return members
 
 
-def estimate(run: PlannedRun, speed: Speed) -> Estimate:
-    """What a run that is missing or was cut still takes."""
-    spec = run.spec
+def estimate(run: PlannedRun, speed: Speed, devices: Choice = "all") -> Estimate:
+    """What a run that is missing or was cut still takes, its members spread over devices."""
+    spec, each = run.spec, place(len(run.spec.members), devices).each
     members, tasks, schedule = len(spec.members), len(spec.tasks), spec.config.schedule
     whole = Schedule(schedule, tasks)
     ticks = (whole.rounds + whole.evaluations) * schedule.phase_ticks
     slots = members * tasks
     simulated = sum(speed.tick_seconds[task] for task in spec.tasks) * members
-    tick = slots * speed.policy_seconds + simulated / min(speed.workers, slots)
+    # How many members wait for one another.
+    in_turn = members if jax.default_backend() == "cpu" else each
+    tick = in_turn * tasks * speed.policy_seconds + simulated / min(speed.workers, slots)
     left = 1 - run.progress
-    seconds = left * (whole.updates * members * speed.update_seconds + ticks * tick)
+    seconds = left * (whole.updates * in_turn * speed.update_seconds + ticks * tick)
     records = whole.rounds * (schedule.phase_ticks + 1)
     if schedule.replay_keep is not None:
         records = min(records, schedule.replay_keep)
     disk = slots * records * _record_bytes(spec)
     disk += CHECKPOINTS * members * _member_bytes(make_agent(spec))
-    memory = _memory(spec, speed.update_bytes, _chunk(spec))
+    memory = _memory(spec, speed.update_bytes, each, _chunk(spec, each))
     seconds += speed.compile_seconds + sum(speed.tick_compile_seconds[task] for task in spec.tasks)
     return Estimate(seconds, memory, disk)
 
 
-def in_memory(spec: RunSpec) -> RunSpec:
-    """The spec with its updates in chunks, where the device's memory is short for all at once (and
-    for the replay, if that lies there too)."""
+def in_memory(spec: RunSpec, devices: Choice = "all") -> RunSpec:
+    """The spec with its updates in chunks, where a device's memory is short for all of its members
+    at once (and for their replay, if that lies there too)."""
     device = jax.local_devices()[0]
     limit = (device.memory_stats() or {}).get("bytes_limit")
-    if limit is None or _chunk(spec) == 1:
+    each = place(len(spec.members), devices).each
+    if limit is None or _chunk(spec, each) == 1:
         return spec
     alone = dataclasses.replace(spec, seeds=spec.seeds[:1])
     update = compiled_update(make_agent(alone))
     update_bytes = max(1, update.memory_analysis().temp_size_in_bytes)
-    taken = _memory(spec, update_bytes, 0)
-    sizes = len(spec.tasks), len(spec.members)
+    taken = _memory(spec, update_bytes, each, 0)
+    sizes = len(spec.tasks), each
     if on_device(make_agent(spec), any(x.has_host for x in envs.specs(spec.tasks)), *sizes)[0]:
         taken += replay_bytes(make_agent(spec), *sizes)
     fits = int(MEMORY_SHARE * limit - taken) // update_bytes
-    if fits >= _chunk(spec):
+    if fits >= _chunk(spec, each):
         return spec
     schedule = dataclasses.replace(
         spec.config.schedule, mapping="chunks", mapping_chunk=max(1, fits)
@@ -126,14 +132,15 @@ def in_memory(spec: RunSpec) -> RunSpec:
     return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
 
 
-def together(runs: Graph, speed: Speed) -> Estimate:
+def together(runs: Graph, speed: Speed, devices: Choice = "all") -> Estimate:
     """What all runs still take: time and disk add up, of memory the largest counts.
 
     Args:
       runs: from `graph.plan_runs`; they come one after another.
       speed: from `measure`.
+      devices: over how many the members of each are spread.
     """
-    each = [estimate(run, speed) for run in due(runs)]
+    each = [estimate(run, speed, devices) for run in due(runs)]
     return Estimate(
         sum(one.seconds for one in each),
         max((one.memory for one in each), default=0),
@@ -141,7 +148,7 @@ def together(runs: Graph, speed: Speed) -> Estimate:
     )
 
 
-def plan_table(runs: Graph, speed: Speed | None) -> str:
+def plan_table(runs: Graph, speed: Speed | None, devices: Choice = "all") -> str:
     """The graph as a table: a row for each run, which names those it needs by number, and totals.
 
     At most 100 columns wide: names that are longer go on in further lines.
@@ -149,13 +156,14 @@ def plan_table(runs: Graph, speed: Speed | None) -> str:
     Args:
       runs: from `graph.plan_runs`.
       speed: from `measure`; without it nothing is said of time, memory and disk.
+      devices: over how many the members of each are spread.
     """
     rows = []
     numbers = {run.name: str(number) for number, run in enumerate(runs, start=1)}
     words = (
         {}
         if speed is None
-        else {run.name: _in_words(estimate(run, speed), speed) for run in due(runs)}
+        else {run.name: _in_words(estimate(run, speed, devices), speed) for run in due(runs)}
     )
     for run in runs:
         state = f"cut at {run.progress:.0%}" if run.state == "cut" else run.state
@@ -168,7 +176,7 @@ def plan_table(runs: Graph, speed: Speed | None) -> str:
         for line, word in itertools.zip_longest(more, told, fillvalue=""):
             rows.append([f"      {line}", "", "", word, "", "", ""])
     agents = str(sum(len(run.cells) for run in runs))
-    total = ["-"] * 3 if speed is None else _in_words(together(runs, speed), speed)
+    total = ["-"] * 3 if speed is None else _in_words(together(runs, speed, devices), speed)
     rows.append(["    together", agents, "", "", *total])
     return aligned(["run", "agents", "needs", "state", "time", "memory", "disk"], rows)
 

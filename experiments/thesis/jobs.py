@@ -19,6 +19,7 @@ import jax
 
 import envs
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
+from dreamer_jax.devices import Choice, check_devices
 from dreamer_jax.files import write_json_atomically
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.locks import FolderInUseError, FolderLock
@@ -49,6 +50,7 @@ class Job:
       workers: simulator processes; by default one per core.
       accept_failed: take sources whose losses were not finite any more, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many to spread its members over.
     """
 
     root: Path
@@ -56,6 +58,7 @@ class Job:
     workers: int | None = None
     accept_failed: bool = False
     timeout: float = envs.SIMULATOR_TIMEOUT
+    devices: Choice = "all"
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ def train(
     *,
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
@@ -93,6 +97,7 @@ def train(
       workers: simulator processes; by default one per core.
       accept_failed: transfer from agents that failed, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many to spread its members over.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
@@ -104,7 +109,7 @@ def train(
         # Of a run that was stopped before anything was kept, perhaps one of other cells.
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec)
+        spec = in_memory(spec, devices)
     try:
         begins = make_run(
             spec,
@@ -114,6 +119,7 @@ def train(
             base=root,
             accept_failed=accept_failed,
             timeout=timeout,
+            devices=devices,
             lock=lock,
             cells=run.cells,
         )
@@ -219,9 +225,18 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
     damaged = _damaged(done, root)
     if lacking := [needed for needed in run.needs if needed not in done or needed in damaged]:
         return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
-    begins(run)
     if train is None:
-        train = functools.partial(_train, accept_failed=job.accept_failed, timeout=job.timeout)
+        try:
+            check_devices(job.devices)
+        except ValueError as error:
+            return Ending(name, "failed", str(error))
+        train = functools.partial(
+            _train,
+            accept_failed=job.accept_failed,
+            timeout=job.timeout,
+            devices=job.devices,
+        )
+    begins(run)
     try:
         kind = train(run, root, job.workers)
     except FolderInUseError:

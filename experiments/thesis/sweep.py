@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import envs
+from dreamer_jax.devices import Choice
 from experiments.runs.folder import folders
 from experiments.thesis.engines import Engine, Resources, Task
 from experiments.thesis.engines.local import in_turn, one_by_one
@@ -64,6 +65,7 @@ def carry_out_runs(
     workers: int | None = None,
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
     resources: Callable[[PlannedRun], Resources] = lambda run: Resources(),
     say: Say = print,
 ) -> Progress:
@@ -76,6 +78,7 @@ def carry_out_runs(
       workers: simulator processes; by default one per core.
       accept_failed: take sources whose losses were not finite any more, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many, of those that a run is given, to spread its members over.
       resources: what a run gets.
       say: where messages go.
     """
@@ -88,7 +91,7 @@ def carry_out_runs(
     names = {run.name for run in left}
     tasks = [
         Task(
-            Job(root, run.name, workers, accept_failed, timeout),
+            Job(root, run.name, workers, accept_failed, timeout, devices),
             run,
             tuple(name for name in run.needs if name in names),
             resources(run),
@@ -107,6 +110,7 @@ def work(
     workers: int | None = None,
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
     train: Train | None = None,
     say: Say = print,
     poll: float = POLL_SECONDS,
@@ -119,6 +123,7 @@ def work(
       workers: simulator processes; by default one per core.
       accept_failed: take sources whose losses were not finite any more, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many, of those that a run is given, to spread its members over.
       train: what trains one run.
       say: where messages go.
       poll: seconds between looks at what others do.
@@ -131,7 +136,7 @@ def work(
         names = {folder for folder, _ in folders(root).values()}
         runs = {folder.name: inspect_run(folder) for folder in sorted(names)}
         return [
-            Task(Job(root, run.name, workers, accept_failed, timeout), run, run.needs)
+            Task(Job(root, run.name, workers, accept_failed, timeout, devices), run, run.needs)
             for run in due(list({**planned, **runs}.values()))
         ]
 

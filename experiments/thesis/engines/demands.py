@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+from dreamer_jax.devices import Choice
 from experiments.thesis import estimate
 from experiments.thesis.engines import Resources
 from experiments.thesis.estimate import Estimate
@@ -33,7 +34,8 @@ def demands(
         # In a process of its own, which ends: asking what device this is takes one into possession.
         spawn = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(1, mp_context=spawn) as processes:
-            found = processes.submit(estimates, tuple(runs), folder).result()
+            devices: Choice = "all" if asked.gpus is not None and asked.gpus > 1 else 1
+            found = processes.submit(estimates, tuple(runs), folder, devices).result()
 
     def demand(run: PlannedRun) -> Resources:
         one = found.get(run.name)
@@ -46,8 +48,10 @@ def demands(
     return demand
 
 
-def estimates(runs: Graph, folder: Path) -> dict[str, Estimate]:
+def estimates(runs: Graph, folder: Path, devices: Choice) -> dict[str, Estimate]:
     """What each run that is due still takes, by name; nothing if this machine is not measured."""
     left = due(runs)
     known = kept([run.spec for run in left], folder) if left else None
-    return {} if known is None else {run.name: estimate.estimate(run, known.speed) for run in left}
+    if known is None:
+        return {}
+    return {run.name: estimate.estimate(run, known.speed, devices) for run in left}

@@ -1,0 +1,257 @@
+"""Populations on several devices: run by tests/test_devices.py in a process of its own, for the
+number of devices is chosen before JAX starts.
+
+The agents are small ones that learn a mean, so that many programs compile in seconds; one law is
+held by the real update too. Axis letters as in dreamer_jax.
+"""
+
+import dataclasses
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from dreamer_jax import population
+from dreamer_jax.agent import Agent
+from dreamer_jax.checkpoint import load_tree
+from dreamer_jax.config import preset
+from dreamer_jax.devices import place
+from dreamer_jax.learning import AgentState
+from dreamer_jax.logs import read_metrics
+from dreamer_jax.population import Population
+from dreamer_jax.randomness import update_key
+from dreamer_jax.training import Member, Run
+from envs.base import TaskSpec
+from envs.bridge import HostEnv
+from probes import Probe
+from runs import batch_for
+
+DEBUG = preset("debug")
+TASKS = ("probe/left", "probe/right")
+
+
+def config_with(**schedule):
+    # No evaluation: what looks into an agent needs a real one.
+    settings = {
+        "environment_steps": 240,
+        "evaluate_every": 10**6,
+        "checkpoint_every": 10**6,
+        "replay": "files",
+    } | schedule
+    return dataclasses.replace(DEBUG, schedule=dataclasses.replace(DEBUG.schedule, **settings))
+
+
+@dataclass(frozen=True)
+class Small(Agent):
+    """An agent whose one parameter learns the mean of what it has seen, with noise of its own."""
+
+    def init(self, seed):
+        value = jax.random.normal(jax.random.key(seed))
+        return self.start({"actor": {"value": value}}, seed)
+
+    def start(self, params, seed):
+        seed = jnp.asarray(seed, jnp.int32)
+        return AgentState(params, {}, jnp.int32(0), seed, jnp.bool_(True))
+
+    def update(self, state, batch):
+        value = state.params["actor"]["value"]
+        noise = jax.random.normal(update_key(state.seed, state.updates))
+        seen = batch.image.astype(jnp.float32).mean() / 255 + batch.reward.mean()
+        new = jnp.where(state.healthy, value + 0.1 * (seen + 0.1 * noise - value), value)
+        state = dataclasses.replace(
+            state, params={"actor": {"value": new}}, updates=state.updates + 1
+        )
+        return state, {"model_loss": (seen - value) ** 2}
+
+    def policy(self, params, carry, image, first, key, mode, updates=0):
+        noise = jax.random.normal(key, (self.action_size,))
+        seen = image.astype(jnp.float32).mean() / 255
+        return jnp.tanh(params["actor"]["value"] * seen + noise), carry
+
+
+class Inside(Probe):
+    """A probe that is a part of the program."""
+
+    has_host = False
+
+
+def made(directory, members, devices, agent, make_env, resume=False):
+    """A run of members on as many devices."""
+    placement = place(members, devices)
+    names = tuple(Member(seed, f"agent {seed}") for seed in range(members))
+    env = make_env(members, placement.count)
+    options = {"videos": 0, "placement": placement, "resume": resume}
+    return Run(agent, env, TASKS, names, directory, **options)
+
+
+def probe(members, shards):
+    env = Inside()
+    env.shards = shards
+    return env
+
+
+def counting(members, shards):
+    """Simulators on the host that count, and fall."""
+    task = TaskSpec("fake/falling", "Falling", 2, "fake_simulators:Falling", "")
+    return HostEnv([task, task], members, 32, 2, 2, workers=2, shards=shards)
+
+
+def trained(*arguments, **options):
+    run = made(*arguments, **options)
+    assert run.train() == "finished"
+    run.close()
+    run.env.close()
+    return run
+
+
+def assert_alike(directory, other, count=None):
+    """The same rows and numbers within rounding, of the first so many members of `other`."""
+    rows, others = read_metrics(directory), read_metrics(other)
+    if count is not None:
+        others = [row for row in others if row["member"] < count]
+    assert len(rows) == len(others) > 0
+    for one, two in zip(rows, others, strict=True):
+        assert list(one) == list(two)
+        for name, value in one.items():
+            if isinstance(value, float):
+                np.testing.assert_allclose(two[name], value, rtol=1e-5, atol=1e-6, err_msg=name)
+            else:
+                assert two[name] == value, (name, value, two[name])
+
+
+def assert_spread(tree, placement):
+    """Each device holds its own members of every leaf, and no others."""
+    expected = NamedSharding(placement.mesh, PartitionSpec("members"))
+    for leaf in jax.tree.leaves(tree):
+        assert leaf.sharding.is_equivalent_to(expected, leaf.ndim), leaf.sharding
+        assert leaf.shape[0] == placement.padded
+        parts = {part.data.shape[0] for part in leaf.addressable_shards}
+        assert parts == {placement.each} and not leaf.is_fully_replicated
+
+
+def the_number_of_devices_does_not_matter(folder):
+    """In files, on the device, and with simulators on the host."""
+    for name, replay, make_env in (
+        ("files", "files", probe),
+        ("device", "device", probe),
+        ("host", "files", counting),
+    ):
+        agent = Small(config_with(replay=replay), 2)
+        counts = (1, 8) if name == "host" else (1, 2, 4, 8)
+        for devices in counts:
+            run = trained(folder / f"{name}-{devices}", 8, devices, agent, make_env)
+            assert run.placement.count == devices and run.counters.updates == 12
+            if devices > 1:
+                assert_spread((run.state, run.sums, run.seeds), run.placement)
+            if devices > 1 and name == "device":
+                assert_spread(run.device_rounds._held, run.placement)
+            assert_alike(folder / f"{name}-1", folder / f"{name}-{devices}")
+
+
+def a_device_trains_its_members_as_if_there_were_no_others(folder):
+    """The program of one of two devices is that of its members alone: the same to the bit."""
+    agent = Small(config_with(), 2)
+    trained(folder / "alone", 4, 1, agent, probe)
+    both = read_metrics(folder / "files-2")
+    alone = read_metrics(folder / "alone")
+    assert json.dumps([row for row in both if row["member"] < 4]) == json.dumps(alone)
+
+
+def padding_is_nowhere_to_be_seen(folder):
+    """7 members on 4 devices, 2 on each: nothing but the 7 is trained, counted or written."""
+    for name, replay, make_env in (("files", "files", probe), ("host", "files", counting)):
+        agent = Small(config_with(replay=replay), 2)
+        run = trained(folder / f"padded-{name}", 7, 4, agent, make_env)
+        assert str(run.placement) == "7 members on 4 of 8 devices, at most 2 on each"
+        assert_alike(folder / f"padded-{name}", folder / f"{name}-1", count=7)
+        assert_spread((run.state, run.sums, run.seeds), run.placement)
+        np.testing.assert_array_equal(np.asarray(run.state.healthy), [True] * 7 + [False])
+        # What makes up the last device stays as it began.
+        first = np.asarray(run.population.fresh().params["actor"]["value"])
+        last = np.asarray(run.state.params["actor"]["value"])
+        assert (first != last).tolist() == [True] * 7 + [False]
+        streams = sorted(path.name for path in (run.directory / "replay").glob("member_*"))
+        assert streams == [f"member_00{member}" for member in range(7)]
+        tree = load_tree(run.directory / "checkpoints")
+        assert {leaf.shape[0] for leaf in jax.tree.leaves(tree)} == {7}
+
+
+class Killed(BaseException):
+    """Stands for what ends a process without letting it save."""
+
+
+def killed_on_many_devices_a_run_goes_on_with_fewer(folder):
+    for members, fewer in ((8, 2), (7, 1)):
+        agent = Small(config_with(checkpoint_every=40), 2)
+        directory = folder / f"killed-{members}"
+        run, spread, left = made(directory, members, 8, agent, probe), Population.update, [9]
+
+        def killing(self, *arguments, left=left, spread=spread):
+            left[0] -= 1
+            if left[0] == 0:
+                raise Killed
+            return spread(self, *arguments)
+
+        population.Population.update = killing
+        try:
+            run.train()
+        except Killed:
+            run.close()
+        finally:
+            population.Population.update = spread
+        assert left == [0]
+        resumed = trained(directory, members, fewer, agent, probe, resume=True)
+        assert resumed.counters.updates == 12
+        assert_alike(directory, folder / "files-1", count=members)
+
+
+def a_replay_on_the_devices_is_filled_from_files_of_another_number(folder):
+    agent = Small(config_with(replay="device"), 2)
+    shorter = Small(config_with(replay="device", environment_steps=160), 2)
+    trained(folder / "longer", 8, 4, shorter, probe)
+    trained(folder / "longer", 8, 2, agent, probe, resume=True)
+    assert_alike(folder / "longer", folder / "device-1")
+
+
+def the_real_update_is_the_same_on_a_device_of_its_own(folder):
+    agent = Agent(DEBUG, 2)
+    batch, results = batch_for(agent, 2), []
+    for devices in (1, 2):
+        members = Population(agent, None, 1, [3, 4], place(2, devices))
+        states = jax.jit(jax.vmap(agent.init))(jnp.arange(2)) if not results else results[0][0]
+        state = members.put(jax.tree.map(jnp.array, states))
+        sums = members.zero_sums(state)
+        results.append((states, *members.update(state, sums, batch)))
+    assert_spread(results[1][1:], place(2, 2))
+    for one, two in zip(*(jax.tree.leaves(x[1:]) for x in results), strict=True):
+        np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-3, atol=1e-5)
+
+
+def members_that_are_few_leave_devices_alone(folder):
+    told = {(3, "all"): (3, 1), (9, "all"): (5, 2), (8, 3): (3, 3), (16, "all"): (8, 2)}
+    for (members, choice), (count, each) in told.items():
+        placement = place(members, choice)
+        assert (placement.count, placement.each) == (count, each)
+        assert 0 <= placement.padded - members < each
+
+
+LAWS = (
+    members_that_are_few_leave_devices_alone,
+    the_number_of_devices_does_not_matter,
+    a_device_trains_its_members_as_if_there_were_no_others,
+    padding_is_nowhere_to_be_seen,
+    killed_on_many_devices_a_run_goes_on_with_fewer,
+    a_replay_on_the_devices_is_filled_from_files_of_another_number,
+    the_real_update_is_the_same_on_a_device_of_its_own,
+)
+
+if __name__ == "__main__":
+    assert jax.local_device_count() == 8
+    for law in LAWS:
+        law(Path(sys.argv[1]))
+        print(law.__name__, flush=True)
