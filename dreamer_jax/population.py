@@ -50,6 +50,12 @@ def map_members(function, mapping: str, chunk: int = 1):
     return mapped
 
 
+@functools.partial(jax.jit, static_argnums=0, inline=True)
+def update_member(agent: Agent, state: AgentState, batch: Records):
+    """`agent.update`, whose tracing takes a second: once for whatever asks with the same shapes."""
+    return agent.update(state, batch)
+
+
 @functools.partial(jax.jit, static_argnames=("agent", "mapping", "chunk"), donate_argnums=(1, 2))
 def update_members(
     agent: Agent, state: AgentState, sums, batch: Records, *, mapping: str, chunk: int
@@ -66,7 +72,8 @@ def update_members(
     Returns:
       The new state, the new sums, and the model's loss of this update, [P].
     """
-    state, metrics = map_members(agent.update, mapping, chunk)(state, batch)
+    update = functools.partial(update_member, agent)
+    state, metrics = map_members(update, mapping, chunk)(state, batch)
     sums = jax.tree.map(jnp.add, sums, metrics)
     return state, sums, metrics["model_loss"]
 
@@ -89,7 +96,7 @@ def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> 
         terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
     )
     member = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
-    metrics = jax.eval_shape(agent.update, member, batch)[1]
+    metrics = update_member.eval_shape(agent, member, batch)[1]
     members = state.updates.shape[0]
     return {name: jnp.zeros(members, x.dtype) for name, x in metrics.items()}
 

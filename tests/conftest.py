@@ -1,5 +1,6 @@
 """Settings of JAX for tests and the processes they start, made before JAX is imported anywhere."""
 
+import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
 )
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 # What tests compile runs for milliseconds: quick compilation matters more than quick code.
 _flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
 # Later versions do not know this flag, and end the process that sets it.
@@ -38,3 +39,9 @@ LONGEST = (
 def pytest_collection_modifyitems(items):
     place = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+def pytest_collection_finish():
+    # What imports have made stays; garbage is looked for in what tests make.
+    gc.collect()
+    gc.freeze()

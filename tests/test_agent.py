@@ -19,6 +19,7 @@ from dreamer_jax.learning import behaviour_loss, model_loss
 from dreamer_jax.losses import gaussian_kl
 from dreamer_jax.population import map_members
 from dreamer_jax.records import Records
+from runs import random_params
 
 A = 2
 CONFIG = preset("debug")
@@ -51,12 +52,30 @@ def agent():
 
 @pytest.fixture(scope="module")
 def update(agent):
-    return jax.jit(agent.update)
+    """Refuses to be traced a second time."""
+    return jax.jit(chex.assert_max_traces(agent.update, n=1))
 
 
 @pytest.fixture(scope="module")
-def state(agent):
-    return jax.jit(agent.init)(0)
+def states(agent):
+    """Of three members."""
+    return jax.jit(jax.vmap(agent.init))(jnp.arange(3))
+
+
+@pytest.fixture(scope="module")
+def state(states):
+    return member(states, 0)
+
+
+@pytest.fixture(scope="module")
+def mapped(agent):
+    """Three members at once."""
+    return jax.jit(map_members(agent.update, "vmap"))
+
+
+def member(tree, number):
+    """One member of a population, as NumPy arrays: slices of those compile nothing."""
+    return jax.tree.map(lambda x: np.asarray(x)[number], tree)
 
 
 def test_updates_lower_the_losses_on_one_repeated_batch(update, state):
@@ -74,10 +93,9 @@ def test_an_update_is_a_function_of_state_and_batch_alone(update, state):
     chex.assert_trees_all_equal(update(state, batch_of()), update(state, batch_of()))
 
 
-def test_nothing_is_traced_twice(agent, state):
-    counted = jax.jit(chex.assert_max_traces(agent.update, n=1))
+def test_nothing_is_traced_twice(update, state):
     for seed in range(4):
-        state, _ = counted(state, batch_of(seed=seed))
+        state, _ = update(state, batch_of(seed=seed))
     assert state.updates == 4
 
 
@@ -90,23 +108,19 @@ def test_agents_of_other_seeds_differ_and_of_the_same_seed_do_not(agent):
 
 
 @pytest.mark.parametrize("mapping", ["vmap", "chunks"])
-def test_a_population_of_three_equals_three_agents_alone(agent, update, mapping):
-    states = jax.jit(jax.vmap(agent.init))(jnp.arange(3))
-    population = jax.jit(map_members(agent.update, mapping, chunk=2))
-    alone = [jax.tree.map(lambda x, p=p: x[p], states) for p in range(3)]
+def test_a_population_of_three_equals_three_agents_alone(agent, update, mapped, states, mapping):
+    population = mapped
+    if mapping == "chunks":
+        population = jax.jit(map_members(agent.update, mapping, chunk=2))
+    alone = [member(states, p) for p in range(3)]
     for step in range(3):
         batches = batch_of(3, seed=step)
         states, metrics = population(states, batches)
         for p in range(3):
-            batch = jax.tree.map(lambda x, p=p: x[p], batches)
-            alone[p], single = update(alone[p], batch)
-            chex.assert_trees_all_close(
-                jax.tree.map(lambda x, p=p: x[p], metrics), single, rtol=1e-3, atol=1e-4
-            )
+            alone[p], single = update(alone[p], member(batches, p))
+            chex.assert_trees_all_close(member(metrics, p), single, rtol=1e-3, atol=1e-4)
     for p in range(3):
-        chex.assert_trees_all_close(
-            jax.tree.map(lambda x, p=p: x[p], states.params), alone[p].params, atol=2e-4
-        )
+        chex.assert_trees_all_close(member(states.params, p), alone[p].params, atol=2e-4)
 
 
 def test_an_unknown_mapping_is_refused_with_the_choices(agent):
@@ -131,7 +145,8 @@ def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, st
     assert all(jnp.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
     # Where actions have no effect on the next state, no gradient reaches the actor.
     params = jax.tree.map(lambda x: x, state.params)
-    params["dynamics"]["action_in"]["kernel"] *= 0.0
+    action_in = params["dynamics"]["action_in"]
+    action_in["kernel"] = 0 * action_in["kernel"]
     blind = gradient_of_actor(params["actor"], params)
     assert optax.tree.norm(blind) == 0.0
 
@@ -235,15 +250,17 @@ def test_what_is_to_be_frozen_and_not_there_is_refused_with_what_there_is(state,
         agent.start(state.params, 0)
 
 
+@functools.cache
+def operations(agent):
+    """Of an update, in floating point."""
+    start = jax.eval_shape(agent.init, 0)
+    return jax.jit(agent.update).lower(start, batch_of()).cost_analysis()["flops"]
+
+
 @pytest.mark.parametrize("frozen", ["encoder", "dynamics/gru", "dynamics/gru/recurrent_kernel"])
-def test_the_gradient_of_what_is_frozen_is_not_computed(agent, state, frozen):
+def test_the_gradient_of_what_is_frozen_is_not_computed(agent, frozen):
     frozen = Agent(with_settings("learning", frozen=(frozen,)), A)
-    start = jax.eval_shape(frozen.init, 0)
-
-    def cost(some, start):
-        return jax.jit(some.update).lower(start, batch_of()).cost_analysis()["flops"]
-
-    assert cost(frozen, start) < cost(agent, state)
+    assert operations(frozen) < operations(agent)
 
 
 class Shifted(networks.Head):
@@ -268,27 +285,25 @@ def test_a_module_takes_the_place_of_a_components_usual_one(agent, state):
     assert hash(shifted) == hash(dataclasses.replace(agent, modules=(("reward", module),)))
 
 
-def test_a_member_whose_loss_is_not_finite_is_frozen_and_the_others_go_on(agent):
-    states = jax.jit(jax.vmap(agent.init))(jnp.arange(2))
-    step = jax.jit(map_members(agent.update, "vmap"))
-    batches = batch_of(2)
-    healthy, _ = step(states, batches)
+def test_a_member_whose_loss_is_not_finite_is_frozen_and_the_others_go_on(mapped, states):
+    batches = batch_of(3)
+    healthy, _ = mapped(states, batches)
     batches.reward[0, 0, 0] = np.nan
-    injected, metrics = step(states, batches)
-    assert_array_equal(injected.healthy, [False, True])
+    injected, metrics = mapped(states, batches)
+    assert_array_equal(injected.healthy, [False, True, True])
     assert not np.isfinite(metrics["reward_loss"][0])
-    member = [jax.tree.map(lambda x, p=p: x[p], injected) for p in range(2)]
-    chex.assert_trees_all_equal(member[0].params, jax.tree.map(lambda x: x[0], states.params))
-    chex.assert_trees_all_close(
-        member[1].params, jax.tree.map(lambda x: x[1], healthy.params), atol=1e-6
-    )
+    chex.assert_trees_all_equal(member(injected.params, 0), member(states.params, 0))
+    for p in (1, 2):
+        chex.assert_trees_all_close(
+            member(injected.params, p), member(healthy.params, p), atol=1e-6
+        )
     # It stays frozen when its batches are sound again, and keeps in step with the others.
-    later, _ = step(injected, batch_of(2, seed=1))
-    assert_array_equal(later.healthy, [False, True])
-    assert_array_equal(later.updates, [2, 2])
+    later, _ = mapped(injected, batch_of(3, seed=1))
+    assert_array_equal(later.healthy, [False, True, True])
+    assert_array_equal(later.updates, [2, 2, 2])
     chex.assert_trees_all_equal(
-        jax.tree.map(lambda x: x[0], (later.params, later.optimisers)),
-        jax.tree.map(lambda x: x[0], (injected.params, injected.optimisers)),
+        member((later.params, later.optimisers), 0),
+        member((injected.params, injected.optimisers), 0),
     )
 
 
@@ -314,7 +329,7 @@ def with_termination_logit(params, logit):
 
 def test_the_termination_heads_target_is_the_discount_and_its_scale_ten():
     agent = Agent(with_settings("network", termination=True), A)
-    params = with_termination_logit(agent.init_params(jax.random.key(0)), 1.5)
+    params = with_termination_logit(random_params(agent), 1.5)
     batch = batch_of()
     batch.terminal[0, :3] = True  # 3 of 10 records
     _, (_, metrics) = jax.jit(lambda p: model_loss(agent, {}, p, batch, jax.random.key(1)))(params)
@@ -329,7 +344,7 @@ def test_the_termination_heads_target_is_the_discount_and_its_scale_ten():
 
 def test_imagination_weighs_what_follows_by_the_termination_head():
     agent, plain = Agent(with_settings("network", termination=True), A), Agent(CONFIG, A)
-    params = agent.init_params(jax.random.key(0))
+    params = random_params(agent)
     # A reward of 2 wherever the agent is.
     out = {"kernel": 0 * params["reward"]["out"]["kernel"], "bias": jnp.full(1, 2.0)}
     params["reward"] = params["reward"] | {"out": out}
@@ -441,13 +456,14 @@ def test_the_entropys_gradient_goes_through_the_samples():
     assert_allclose(jax.grad(entropy)(outputs), jax.grad(by_hand)(outputs), rtol=1e-4)
 
 
-def test_the_images_spread_divides_its_loss_by_its_square():
+def test_the_images_spread_divides_its_loss_by_its_square(state):
     batch, key = batch_of(), jax.random.key(1)
     losses = {}
     for std in (1.0, 0.5):
         agent = Agent(with_settings("learning", image_std=std, reward_std=2 * std), A)
-        params = agent.init_params(jax.random.key(0))
-        loss, (_, metrics) = jax.jit(functools.partial(model_loss, agent, {}))(params, batch, key)
+        loss, (_, metrics) = jax.jit(functools.partial(model_loss, agent, {}))(
+            state.params, batch, key
+        )
         losses[std] = metrics
         expected = metrics["image_loss"] / std**2 + metrics["reward_loss"] / (2 * std) ** 2 + 3.0
         assert_allclose(loss, expected, rtol=1e-5)

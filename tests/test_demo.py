@@ -106,14 +106,15 @@ ABOUT = (("one", 6), ("two", 4))
 def test_the_demo_trains_tells_and_shows(tmp_path, capsys):
     pytest.importorskip("pybullet")
     write_run(tmp_path / "source", spec_of("inverted_pendulum"))
-    words = ["demo", "--preset", "debug", "--results", str(tmp_path / "results"), "--seeds", "0"]
-    words += ["--source", str(tmp_path / "source")]
+    # Six agents, as many as in tests/test_tables.py: they share their compiled functions.
+    words = ["demo", "--preset", "debug", "--results", str(tmp_path / "results")]
+    words += ["--seeds", "0", "1", "--source", str(tmp_path / "source")]
     assert main(words) == 0
     output = capsys.readouterr().out
     assert "reward/out/kernel" in output and "fraction(omega=0..0.2)" in output
     for label in ("omega=0", "omega=0.2", "baseline"):
         assert any(line.startswith(label) and "±" in line for line in output.splitlines())
-    assert "InvertedPendulum: 1 seed" in output.splitlines()[-1]
+    assert "InvertedPendulum: 2 seeds are too few" in output.splitlines()[-1]
     folder = tmp_path / "results" / "debug" / "demo"
     for name in ("curves.png", "videos/beside_each_other.mp4"):
         assert (folder / name).stat().st_size > 1000

@@ -88,8 +88,8 @@ def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
 def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_seeds():
     batches = stored_batches(agent_of("float32"))
 
-    def losses(precision):
-        """Means over the last 100 updates, each [SEEDS]."""
+    def losses(precision, seeds):
+        """Those of all updates, each [seeds, UPDATES]."""
         agent = agent_of(precision)
 
         def update(state, number):
@@ -101,15 +101,16 @@ def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_s
 
         # One after another: that compiles faster than all at once.
         every = jax.jit(lambda seeds: jax.lax.map(train, seeds))
-        states, history = every(jnp.arange(SEEDS))
+        states, history = every(jnp.arange(seeds))
         assert states.healthy.all()
         return {name: np.asarray(x) for name, x in history.items()}
 
-    exact, rounded = losses("float32"), losses("bfloat16")
+    # Other seeds in float32 say what noise is; in bfloat16 the first one is enough.
+    exact, rounded = losses("float32", SEEDS), losses("bfloat16", 1)
     for name in LOSSES:
         first, last = (exact[name][:, part].mean() for part in (slice(10), slice(-100, None)))
-        ends = [history[name][:, -100:].mean(1) for history in (exact, rounded)]
-        noise = ends[0].std(ddof=1)
-        assert abs(ends[0].mean() - ends[1].mean()) < noise, name
+        ends = exact[name][:, -100:].mean(1)
+        difference = abs(ends[0] - rounded[name][0, -100:].mean())
+        assert difference < ends.std(ddof=1), name
         if name in ("image_loss", "reward_loss", "termination_loss"):
             assert last < 0.8 * first, f"{name} was learned"
