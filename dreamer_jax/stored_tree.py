@@ -30,6 +30,7 @@ from dreamer_jax.schema import LEAVES, check_shape
 Tree = TypeVar("Tree")
 _FORMAT = 1
 _SHOWN = 5  # differences listed in an error
+_FILES_ROOM = 256 * 1024  # bytes that some forty files take in whole blocks, beside what they hold
 
 
 class CorruptCheckpointError(Exception):
@@ -95,7 +96,7 @@ def _require_room(folder: Path, size: int) -> None:
     """Refuses a disk that is full before anything is written: of one that gets full, TensorStore's
     threads tell in traces of their own."""
     disk = shutil.disk_usage(folder)
-    if disk.total and disk.free < size:  # some file systems do not say
+    if disk.total and disk.free < 1.05 * size + _FILES_ROOM:  # some file systems do not say
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
