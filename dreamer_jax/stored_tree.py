@@ -8,9 +8,11 @@ and whether what is read is what was written, to the bit.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import re
+import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -28,6 +30,7 @@ from dreamer_jax.schema import LEAVES, check_shape
 Tree = TypeVar("Tree")
 _FORMAT = 1
 _SHOWN = 5  # differences listed in an error
+_FILES_ROOM = 256 * 1024  # bytes that some forty files take in whole blocks, beside what they hold
 
 
 class CorruptCheckpointError(Exception):
@@ -76,6 +79,7 @@ def write_tree(folder: Path, tree: Any) -> None:
         )
     # Orbax stores no empty arrays; their shapes are in the table.
     stored = _nested({path: value for path, value in values.items() if value.size})
+    _require_room(folder, sum(value.nbytes for value in values.values()))
     try:
         if stored:
             with _orbax() as checkpointer:
@@ -86,6 +90,14 @@ def write_tree(folder: Path, tree: Any) -> None:
             raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
         raise
     write_json_atomically(folder / "leaves.json", {"format": _FORMAT, "leaves": table})
+
+
+def _require_room(folder: Path, size: int) -> None:
+    """Refuses a disk that is full before anything is written: of one that gets full, TensorStore's
+    threads tell in traces of their own."""
+    disk = shutil.disk_usage(folder)
+    if disk.total and disk.free < 1.05 * size + _FILES_ROOM:  # some file systems do not say
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def read_tree(

@@ -11,6 +11,7 @@ import textwrap
 import time
 import warnings
 from collections import OrderedDict
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import flax.struct
@@ -328,8 +329,17 @@ class FullOrbax:
     __exit__ = lambda self, *_: None  # noqa: E731
 
 
+def little_room(_):
+    return SimpleNamespace(total=10**9, free=1000)
+
+
 @pytest.mark.parametrize(
-    ("name", "failure"), [("write_json_atomically", full_disk), ("_orbax", FullOrbax)]
+    ("name", "failure"),
+    [
+        ("write_json_atomically", full_disk),
+        ("_orbax", FullOrbax),
+        ("shutil", SimpleNamespace(disk_usage=little_room)),
+    ],
 )
 def test_a_full_disk_leaves_the_earlier_checkpoints_and_says_so(folder, monkeypatch, name, failure):
     monkeypatch.setattr(stored_tree, name, failure)
@@ -340,6 +350,13 @@ def test_a_full_disk_leaves_the_earlier_checkpoints_and_says_so(folder, monkeypa
     monkeypatch.undo()
     assert len(list(folder.iterdir())) == 2
     assert_identical(checkpointer.restore(run_state())[0], run_state(2))
+
+
+def test_a_disk_without_room_is_told_before_anything_is_written(folder, monkeypatch):
+    monkeypatch.setattr(stored_tree, "shutil", SimpleNamespace(disk_usage=little_room))
+    monkeypatch.setattr(stored_tree, "_orbax", lambda: pytest.fail("Orbax was called"))
+    with pytest.raises(OSError, match="No space left"):
+        Checkpointer(folder).save(3, run_state(3), {})
 
 
 # --- kill -9 --------------------------------------------------------------------------------------

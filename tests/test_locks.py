@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from dreamer_jax.locks import FolderInUseError, FolderLock
+from dreamer_jax.locks import FolderInUseError, FolderLock, Presence
 
 
 def hold(directory, ready, leave):
@@ -50,3 +50,13 @@ def test_a_folder_that_cannot_be_written_is_told_as_such(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(OSError, match="could not lock"):
         FolderLock(tmp_path)
+
+
+def test_who_comes_first_is_alone_until_the_last_has_left(tmp_path):
+    with Presence(tmp_path) as first, Presence(tmp_path) as second:
+        assert (first.alone, second.alone) == (True, False)
+        first.release()
+        with Presence(tmp_path) as third:
+            assert not third.alone
+    with Presence(tmp_path / "elsewhere") as other, Presence(tmp_path) as again:
+        assert other.alone and again.alone

@@ -28,6 +28,7 @@ def run(tmp_path_factory):
         ["demo", "--preset", "debug", "--source", "RUN", "--results", "OUT"],
         ["table", "7", "--preset", "debug", "--results", "OUT"],
         ["figure", "12", "--preset", "debug", "--results", "OUT"],
+        ["sweep", "--table", "7", "--preset", "debug", "--results", "OUT"],
         ["plan", "--table", "7", "--preset", "debug", "--results", "OUT"],
     ],
     ids=lambda words: words[0],
@@ -43,7 +44,7 @@ def test_every_command_that_simulates_says_how_long_a_simulator_may_take(
 
     places = ("experiments.runs.run.make_env", "experiments.runs.evaluate.make_env")
     for place in places:
-        monkeypatch.setattr(place, lambda spec, workers, timeout: note(timeout=timeout))
+        monkeypatch.setattr(place, lambda spec, workers, timeout, **_: note(timeout=timeout))
     for place in ("envs.make", "experiments.thesis.speeds.measure"):
         monkeypatch.setattr(place, note)
     monkeypatch.setattr("experiments.runs.run.transferred_members", lambda *_, **__: (None, None))

@@ -87,7 +87,7 @@ def asked(monkeypatch, measured, tmp_path):
     monkeypatch.setattr(thesis.sys.stdin, "isatty", lambda: True, raising=False)
     monkeypatch.setattr("builtins.input", lambda question: questions.append(question) or "n")
 
-    def carry_out(entries, sweep):
+    def carry_out(entries, sweep, execution):
         begun.append(entries)
         raise KeyboardInterrupt
 

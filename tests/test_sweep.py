@@ -1,6 +1,9 @@
 """Running the graph: in order, once each, going on where one fails; and what it will take."""
 
 import dataclasses
+import functools
+import os
+import socket
 from types import SimpleNamespace
 
 import jax
@@ -11,14 +14,16 @@ from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from envs import SimulatorError
 from experiments.runs import memory
 from experiments.runs.folder import folders
-from experiments.thesis import estimate
-from experiments.thesis import sweep as sweeps
+from experiments.thesis import estimate, jobs
+from experiments.thesis.engines import local
+from experiments.thesis.engines.local import one_by_one
 from experiments.thesis.estimate import plan_table
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, closure, shown
 from experiments.thesis.measurement import Speed
+from experiments.thesis.reservations import planned
 from experiments.thesis.sweep import carry_out_runs
-from runs import CONFIG, finish
+from runs import CONFIG, Trainer, finish
 
 TWO_TARGETS = (
     dataclasses.replace(TABLES["table-3"], counts=(2,), omegas=(0.1, 0.2)),
@@ -26,34 +31,22 @@ TWO_TARGETS = (
 )
 HOPPER, WALKER = "bullet-Hopper-fractional", "bullet-Walker2D-fractional"
 HOPPERS_SOURCE = "bullet-HalfCheetah+Walker2D-seed-0"
+WALKERS_SOURCE = "bullet-HalfCheetah+Hopper-seed-0"
+
+
+def cells_of(*entries, seeds=(0, 1)):
+    return [cell for entry in entries or TWO_TARGETS for cell in shown(entry, seeds)]
 
 
 def plan(root, *entries, seeds=(0, 1)):
-    cells = [cell for entry in entries or TWO_TARGETS for cell in shown(entry, seeds)]
-    return plan_runs(cells, CONFIG, root)
-
-
-class Trainer:
-    """Finishes runs in a moment and notes their names; those named in `failing` raise."""
-
-    def __init__(self, failing=None, stop_at=None):
-        self.failing, self.stop_at, self.trained = failing or {}, stop_at, []
-
-    def __call__(self, run, root, workers):
-        self.trained.append(run.name)
-        if run.name == self.stop_at:
-            finish(run, root, share=0.5)
-            return "stopped"
-        if run.name in self.failing:
-            finish(run, root, share=0.5)
-            raise self.failing[run.name]
-        finish(run, root)
-        return "finished"
+    return plan_runs(cells_of(*entries, seeds=seeds), CONFIG, root)
 
 
 def sweep(root, *entries, **behaviour):
     trainer, said = Trainer(**behaviour), []
-    progress = carry_out_runs(plan(root, *entries), root, train=trainer, say=said.append)
+    engine = functools.partial(one_by_one, train=trainer, poll=0.01)
+    with planned(cells_of(*entries), CONFIG, root) as runs:
+        progress = carry_out_runs(runs, root, engine=engine, say=said.append)
     return progress, trainer.trained, said
 
 
@@ -128,21 +121,38 @@ def test_a_source_with_damaged_parameters_is_set_aside_and_not_its_targets(tmp_p
     assert list(progress.skipped) == [HOPPER] and HOPPER not in trained
 
 
-def test_two_sweeps_at_once_are_refused(tmp_path):
+def test_two_sweeps_at_once_share_the_work_and_train_nothing_twice(tmp_path, monkeypatch):
+    def interrupted(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(local.time, "sleep", interrupted)
+    second = []
+
     def train(run, root, workers):
-        with pytest.raises(ValueError, match="another command is training in .*--results"):
-            sweep(tmp_path)
+        if not second:  # while this run, the first, is in training
+            second.append(None)
+            second[:] = sweep(tmp_path)
         return Trainer()(run, root, workers)
 
-    assert carry_out_runs(plan(tmp_path), tmp_path, train=train, say=lambda _: None).complete
+    with planned(cells_of(), CONFIG, tmp_path) as runs:
+        engine = functools.partial(one_by_one, train=train)
+        first = carry_out_runs(runs, tmp_path, engine=engine, say=lambda _: None)
+    progress, trained, said = second
+    # What is ready is done at once; what is in training, or needs it, is waited for.
+    assert trained == progress.finished == [WALKERS_SOURCE, WALKER] and progress.stopped
+    holder = f"process {os.getpid()} on {socket.gethostname()}, since 20"
+    assert said[-1].startswith(f"waiting: {HOPPERS_SOURCE} is trained by {holder}")
+    assert first.complete
+    assert first.finished == [HOPPERS_SOURCE, HOPPER]
+    assert first.shared == [WALKERS_SOURCE, WALKER]
 
 
 def test_what_a_run_compiled_is_freed_after_it(tmp_path, monkeypatch):
     compiled = jax.jit(lambda x: x + 1)
-    monkeypatch.setattr(sweeps, "make_run", lambda *_, **__: 1)
-    monkeypatch.setattr(sweeps, "carry_out", lambda run: compiled(run) and "finished")
+    monkeypatch.setattr(jobs, "make_run", lambda *_, **__: 1)
+    monkeypatch.setattr(jobs, "carry_out", lambda run: compiled(run) and "finished")
     source, *_ = plan(tmp_path)
-    assert sweeps.train(source, tmp_path, None) == "finished"
+    assert jobs.train(source, tmp_path, None) == "finished"
     assert compiled._cache_size() == 0
 
 

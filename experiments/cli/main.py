@@ -16,7 +16,7 @@ import tyro
 
 from dreamer_jax.output import safe_output
 from dreamer_jax.ranges import check_ranges
-from experiments.cli import demo, reports, runs, sharing, thesis
+from experiments.cli import demo, engines, reports, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 from experiments.cli.options import CONSTRUCTORS, Base, read_base
 
@@ -55,6 +55,8 @@ COMMANDS = {
     "zoo": _plain(sharing.Zoo, sharing.zoo),
     "table": _plain(thesis.Tables, thesis.tables, thesis.table_defaults),
     "figure": _plain(thesis.Figures, thesis.figures, thesis.figure_defaults),
+    "sweep": _plain(thesis.Sweeps, thesis.sweep, thesis.sweep_defaults),
+    "work": _plain(engines.Work, engines.work),
     "plan": _plain(thesis.Plan, thesis.plan, thesis.plan_defaults),
     "seeds": _plain(reports.Seeds, reports.seeds),
     "demo": _plain(demo.Demo, demo.demo),

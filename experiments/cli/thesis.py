@@ -1,9 +1,11 @@
-"""Commands on the thesis's grid: table, figure, plan. Their options, and what they do.
+"""Commands on the thesis's grid: table, figure, sweep, plan. Their options, and what they do.
 
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
-import functools
+import contextlib
+import dataclasses
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +16,14 @@ import tyro
 
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
-from experiments.cli.exits import FAILURE, STOPPED, usage_errors
+from experiments.cli.engines import (
+    Execution,
+    check_execution,
+    chosen_run,
+    engine_options,
+    tell_problems,
+)
+from experiments.cli.exits import STOPPED, usage_errors
 from experiments.cli.options import (
     DEFAULT_PRESET,
     Base,
@@ -84,6 +93,7 @@ class Tables:
     names: tyro.conf.Positional[tuple[str, ...]]
     """Numbers of tables (1 to 17), or all."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+    execution: tyro.conf.OmitArgPrefixes[Execution] = Execution()
 
 
 @dataclass(frozen=True)
@@ -93,6 +103,22 @@ class Figures:
     names: tyro.conf.Positional[tuple[str, ...]]
     """Numbers of figures (10 to 39), or all."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+    execution: tyro.conf.OmitArgPrefixes[Execution] = Execution()
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """Train what tables and figures of the thesis need, and make no reports of it.
+
+    As `table` and `figure` do it: what is done is not repeated, and what was cut goes on.
+    """
+
+    table: tuple[str, ...] = ()
+    """Numbers of tables (1 to 17), or all."""
+    figure: tuple[str, ...] = ()
+    """Numbers of figures (10 to 39), or all."""
+    sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
+    execution: tyro.conf.OmitArgPrefixes[Execution] = Execution()
 
 
 @dataclass(frozen=True)
@@ -110,6 +136,8 @@ class Plan:
     """Numbers of figures (10 to 39), or all."""
     measure: bool = False
     """Measure this machine anew."""
+    json: bool = False
+    """Print the graph as JSON, with estimates where this machine was measured before."""
     sweep: tyro.conf.OmitArgPrefixes[Sweep] = Sweep()
 
 
@@ -130,6 +158,11 @@ def table_defaults(base: Base) -> Tables:
 def figure_defaults(base: Base) -> Figures:
     """Defaults of `figure`."""
     return Figures(names=tyro.MISSING, sweep=_sweep(base))
+
+
+def sweep_defaults(base: Base) -> Sweeps:
+    """Defaults of `sweep`."""
+    return Sweeps(sweep=_sweep(base))
 
 
 def plan_defaults(base: Base) -> Plan:
@@ -164,24 +197,47 @@ def tables(command: Tables) -> int:
     """Makes tables."""
     with usage_errors():
         entries = chosen(grid.TABLES, command.names, command.sweep.backend)
-    compared = command.sweep.compared
-    return _make([grid.beside(entry, compared) for entry in entries], command.sweep)
+    beside = [grid.beside(entry, command.sweep.compared) for entry in entries]
+    return _make(beside, command.sweep, command.execution)
 
 
 def figures(command: Figures) -> int:
     """Makes figures."""
     with usage_errors():
         entries = chosen(grid.FIGURES, command.names, command.sweep.backend)
-    return _make(entries, command.sweep)
+    return _make(entries, command.sweep, command.execution)
 
 
-def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
-    """The runs behind tables and figures."""
-    from dreamer_jax.devices import check_devices
-    from experiments.thesis.graph import plan_runs
+def sweep(command: Sweeps) -> int:
+    """Trains what tables and figures need."""
+    entries = _entries(command.table, command.figure, command.sweep, "train")
+    if not _begins(entries, command.sweep, command.execution):
+        return STOPPED
+    _, progress = _carry_out(entries, command.sweep, command.execution)
+    return tell_problems(progress)
 
+
+def _entries(
+    table: Sequence[str], figure: Sequence[str], sweep: Sweep, verb: str
+) -> list[Table | Figure]:
+    """The tables and figures of the given numbers."""
     with usage_errors():
-        check_devices(sweep.devices)
+        if not (table or figure):
+            raise ValueError(f"nothing to {verb}: add --table 3, or --figure 12, or all of them")
+        entries: list[Table | Figure] = [
+            *(chosen(grid.TABLES, table, sweep.backend) if table else ()),
+            *(chosen(grid.FIGURES, figure, sweep.backend) if figure else ()),
+        ]
+    return [grid.beside(entry, sweep.compared) for entry in entries]
+
+
+def _cells(entries: Sequence[Table | Figure], sweep: Sweep) -> list[grid.Cell]:
+    """The cells that tables and figures show.
+
+    Raises:
+      UsageError: what is asked for is not there.
+    """
+    with usage_errors():
         if not sweep.seeds or len(set(sweep.seeds)) < len(sweep.seeds):
             raise ValueError(f"seeds {sweep.seeds} must be one or more, each named once")
         for name, wanted, there in (
@@ -191,49 +247,58 @@ def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
             if not wanted or not set(wanted) <= set(there):
                 raise ValueError(f"{name} {wanted} must be one or more of {there}")
         entries = [grid.restricted(entry, sweep.omegas, sweep.counts) for entry in entries]
-        cells = [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
-        return plan_runs(cells, sweep.config, sweep.root)
+        return [cell for entry in entries for cell in grid.shown(entry, sweep.seeds)]
 
 
-def _carry_out(entries: Sequence[Table | Figure], sweep: Sweep) -> "tuple[Graph, Progress]":
+def _planned(entries: Sequence[Table | Figure], sweep: Sweep) -> "Graph":
+    """The runs behind tables and figures, beside what others are at; nothing is reserved."""
+    from dreamer_jax.devices import check_devices
+    from experiments.thesis.graph import plan_runs
+    from experiments.thesis.reservations import standing
+
+    cells = _cells(entries, sweep)
+    with usage_errors():
+        check_devices(sweep.devices)
+        return plan_runs(cells, sweep.config, sweep.root, standing(sweep.root))
+
+
+def _carry_out(
+    entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution
+) -> "tuple[Graph, Progress]":
     """Trains what is missing of tables and figures.
 
     Returns:
       The runs behind them, and what became of these.
 
     Raises:
-      UsageError: results of other settings are there, or a simulator is not installed.
+      UsageError: results of other settings are there, or a simulator or an engine is not installed.
     """
+    from dreamer_jax.devices import check_devices
     from dreamer_jax.host_memory import keep_freed_memory
     from experiments.thesis.graph import due
-    from experiments.thesis.sweep import carry_out_runs, train
+    from experiments.thesis.reservations import planned
+    from experiments.thesis.sweep import carry_out_runs
 
-    runs = _planned(entries, sweep)
-    if due(runs):
-        keep_freed_memory()
-    trains = functools.partial(
-        train,
-        accept_failed=sweep.accept_failed,
-        timeout=sweep.simulators.simulator_timeout,
-        devices=sweep.devices,
-    )
-    with usage_errors():
-        progress = carry_out_runs(runs, sweep.root, workers=sweep.simulators.workers, train=trains)
-    if progress.stopped:
+    cells = _cells(entries, sweep)
+    with contextlib.ExitStack() as at_work:
+        with usage_errors():
+            check_execution(execution)
+            if execution.executor == "local":  # elsewhere, there are those of each run
+                check_devices(sweep.devices)
+            runs = at_work.enter_context(planned(cells, sweep.config, sweep.root))
+            wanted = chosen_run(runs, execution.run)
+            if execution.executor == "local" and due(wanted):
+                keep_freed_memory()
+            progress = carry_out_runs(
+                wanted,
+                sweep.root,
+                **engine_options(execution, wanted, sweep.simulators),
+                accept_failed=sweep.accept_failed,
+                devices=sweep.devices,
+            )
+    if progress.stopped and not progress.left:
         print(f"stopped and saved in {sweep.root}: the same command goes on")
     return runs, progress
-
-
-def _tell_problems(progress: "Progress") -> int:
-    """Names what was not trained.
-
-    Returns:
-      The exit code.
-    """
-    for kind, names in (("failed", progress.failed), ("skipped", progress.skipped)):
-        for name, reason in names.items():
-            print(f"{kind}: {name}: {reason}", file=sys.stderr)
-    return 0 if progress.complete else FAILURE
 
 
 def plan(command: Plan) -> int:
@@ -242,16 +307,15 @@ def plan(command: Plan) -> int:
     from experiments.thesis.graph import due
 
     sweep = command.sweep
-    with usage_errors():
-        if not (command.table or command.figure):
-            raise ValueError("nothing to plan: add --table 3, or --figure 12, or all of them")
-        entries: list[Table | Figure] = [
-            *(chosen(grid.TABLES, command.table, sweep.backend) if command.table else ()),
-            *(chosen(grid.FIGURES, command.figure, sweep.backend) if command.figure else ()),
-        ]
-    runs = _planned([grid.beside(entry, sweep.compared) for entry in entries], sweep)
+    entries = _entries(command.table, command.figure, sweep, "plan")
+    runs = _planned(entries, sweep)
     left = due(runs)
     timeout = sweep.simulators.simulator_timeout
+    if command.json:
+        if command.measure and left:
+            _speed(left, timeout, again=True)
+        print(json.dumps(_as_json(runs, sweep), indent=1))
+        return 0
     known = _speed(left, timeout, again=command.measure) if left else None
     print(f"\n{', '.join(entry.name for entry in entries)}, preset {sweep.preset}: {sweep.root}\n")
     print(estimate.plan_table(runs, known and known.speed, sweep.devices))
@@ -269,6 +333,31 @@ def plan(command: Plan) -> int:
                 f"{known.speed.scaled:.3g}: its time may be off by {measurement.SCALING_ERROR:.0%}."
             )
     return 0
+
+
+def _as_json(runs: "Graph", sweep: Sweep) -> dict[str, object]:
+    """The graph as JSON holds it: what it is, and of each run what an engine asks."""
+    from experiments.thesis.engines.demands import estimates
+    from experiments.thesis.graph import PlannedRun
+    from experiments.thesis.speeds import cache_folder
+
+    known = estimates(runs, cache_folder(), sweep.devices)
+    found = []
+    for run in runs:
+        one = known.get(run.name)
+        estimated = {} if one is None else dataclasses.asdict(one)
+        found.append(
+            {
+                "name": run.name,
+                "needs": run.needs,
+                "state": run.state,
+                "progress": run.progress if isinstance(run, PlannedRun) else None,
+                "tasks": run.spec.tasks if isinstance(run, PlannedRun) else None,
+                "cells": run.cells,
+                **{key: estimated.get(key) for key in ("seconds", "memory", "disk")},
+            }
+        )
+    return {"root": str(sweep.root), "preset": sweep.preset, "runs": found}
 
 
 LONG_SECONDS = 3600.0
@@ -318,20 +407,32 @@ def _may_begin(runs: "Graph", timeout: float, devices: Devices) -> bool:
         return False
 
 
-def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
+def _begins(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution) -> bool:
+    """Whether to begin: what takes long here is asked about at a terminal."""
+    with usage_errors():
+        check_execution(execution)
+    if execution.executor != "local" or sweep.yes or not sys.stdin.isatty():
+        return True
+    runs = _planned(entries, sweep)
+    with usage_errors():
+        wanted = chosen_run(runs, execution.run)
+    if _may_begin(wanted, sweep.simulators.simulator_timeout, sweep.devices):
+        return True
+    print("nothing was begun")
+    return False
+
+
+def _make(entries: Sequence[Table | Figure], sweep: Sweep, execution: Execution) -> int:
     """Trains what is missing and writes tables and figures."""
     from dreamer_jax.progress import reported
     from experiments.cli.reports import write_reports
     from experiments.thesis.latent_tables import make_table
 
-    if not sweep.yes and sys.stdin.isatty():
-        timeout = sweep.simulators.simulator_timeout
-        if not _may_begin(_planned(entries, sweep), timeout, sweep.devices):
-            print("nothing was begun")
-            return STOPPED
-    runs, progress = _carry_out(entries, sweep)
-    if progress.stopped:
+    if not _begins(entries, sweep, execution):
         return STOPPED
+    runs, progress = _carry_out(entries, sweep, execution)
+    if progress.stopped or execution.run is not None:
+        return tell_problems(progress)
     run_of = {cell: run.name for run in runs for cell in run.cells}
     for entry in entries:
         if not isinstance(entry, LatentTable):
@@ -354,4 +455,4 @@ def _make(entries: Sequence[Table | Figure], sweep: Sweep) -> int:
         except ValueError as error:
             progress.failed[entry.name] = str(error)
     write_reports(entries, sweep.root, sweep.backend, sweep.seeds)
-    return _tell_problems(progress)
+    return tell_problems(progress)

@@ -1,8 +1,9 @@
 """The graph of runs behind cells of the grid: what is done, what is missing, and in which order."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 from dreamer_jax import config as configs
@@ -19,6 +20,16 @@ from experiments.thesis.populations import (
     config_of,
     new_populations,
     of_length,
+)
+
+# What reading a damaged folder raises; a checkpoint that its run replaces meanwhile is not found.
+_UNREADABLE = (
+    FileNotFoundError,
+    ValueError,
+    KeyError,
+    TypeError,
+    IndexError,
+    CorruptCheckpointError,
 )
 
 
@@ -101,7 +112,12 @@ def _of_results(one: Config, other: Config) -> tuple[Difference, ...]:
     return tuple(pair for pair in pairs if pair.path not in OF_THE_MACHINE)
 
 
-def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> Graph:
+def plan_runs(
+    cells: Iterable[Cell],
+    config: Config,
+    root: str | Path,
+    reserved: Mapping[str, PlannedRun] = MappingProxyType({}),
+) -> Graph:
     """The runs behind cells, each after those that it needs, and those that were cut first.
 
     Cells that are done, or whose run has begun, need no source any more: nothing is repeated, and
@@ -111,6 +127,7 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> Graph:
       cells: what is asked for.
       config: settings of all runs, those of a preset.
       root: the folder of all results of these settings.
+      reserved: runs that others plan there, by name; those that have begun are as they are found.
 
     Raises:
       ValueError: a run was made with other settings; names them on both sides.
@@ -119,6 +136,22 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> Graph:
     held, found = _places(root)
     used = {run.name: run for run in found.values() if not run.cells}
     missing: dict[Cell, None] = {}
+    begun_names = {name for name, _ in held.values()} | set(found)
+    for run in reserved.values():
+        if run.name not in begun_names:
+            found[run.name] = run
+            for member, cell_name in enumerate(run.cells):
+                held.setdefault(cell_name, (run.name, member))
+
+    def use(name: str) -> PlannedRun | DamagedRun:
+        if name not in found:
+            found[name] = inspect_run(root / name)
+        if name not in used:
+            used[name] = found[name]
+            for needed in found[name].needs:  # of those that others plan perhaps for other cells
+                if needed in reserved or begun(root / needed):
+                    use(needed)
+        return found[name]
 
     def visit(cell: Cell) -> None:
         if cell in missing:
@@ -129,17 +162,16 @@ def plan_runs(cells: Iterable[Cell], config: Config, root: str | Path) -> Graph:
             missing.setdefault(cell)
             return
         name, _ = held[cell.name]
-        if name not in found:
-            found[name] = _inspect(root / name)
-        used[name] = found[name]
-        _check_settings(root / name, found[name], config_of(cell, config))
-        if found[name].needs:
+        run = use(name)
+        _check_settings(root / name, run, config_of(cell, config))
+        if run.needs:
             for needed in cell.needs:
                 visit(needed)
 
     for cell in cells:
         visit(cell)
-    populations = new_populations(tuple(missing), config, held, _taken_names(root))
+    taken = _taken_names(root) | set(reserved)
+    populations = new_populations(tuple(missing), config, held, taken)
     new = [_planned(population) for population in populations]
     there = sorted(used.values(), key=lambda run: run.state != "cut")
     return _in_order([*there, *new])
@@ -194,10 +226,11 @@ def _places(
     return held, damaged
 
 
-def _inspect(folder: Path) -> PlannedRun | DamagedRun:
-    """A run as its folder tells."""
-    cells = read_cells(folder)
+def inspect_run(folder: Path) -> PlannedRun | DamagedRun:
+    """A run that has begun, as its folder tells."""
+    cells: tuple[str, ...] = ()
     try:
+        cells = read_cells(folder)
         spec = read_spec(folder)
         if len(spec.members) != len(cells):
             raise ValueError(f"{folder} has {len(spec.members)} agents and names {len(cells)}")
@@ -219,7 +252,7 @@ def _inspect(folder: Path) -> PlannedRun | DamagedRun:
                 failed=failed,
             )
         counters = Counters(**checkpoints.metadata(latest)["counters"])
-    except (ValueError, KeyError, TypeError, IndexError, CorruptCheckpointError) as error:
+    except _UNREADABLE as error:
         return DamagedRun(folder.name, cells, str(error))
     done = schedule.next(counters) == "done"
     progress = counters.updates / max(1, schedule.updates)

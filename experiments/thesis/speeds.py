@@ -85,6 +85,16 @@ def speed_of(
     return Known(found, path, kept=False)
 
 
+def kept(specs: Sequence[RunSpec], folder: Path) -> Known | None:
+    """What was measured on this machine before of runs of one preset, if all of it was."""
+    path = folder / f"{_key(specs[0].config)}.json"
+    found = _read(path)
+    tasks = {task for spec in specs for task in spec.tasks}
+    if found is None or not tasks <= set(found.tick_seconds):
+        return None
+    return Known(found, path, kept=True)
+
+
 def _machine() -> dict[str, object]:
     """What a measurement depends on beside the settings."""
     return {

@@ -1,29 +1,18 @@
-"""Runs planned runs one after another: what was cut goes on, what fails is named, the rest goes on.
+"""Carries out planned runs on an engine: what was cut goes on, what fails is named, the rest goes
+on. Those that need what failed are left for the next time."""
 
-A run whose folder is damaged is set aside: renamed, never deleted. Those that need it are left for
-the next time.
-"""
-
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
-
-import jax
 
 import envs
-from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError, load_tree
 from dreamer_jax.devices import Choice
-from dreamer_jax.files import write_json_atomically
-from dreamer_jax.locks import FolderInUseError, FolderLock
-from dreamer_jax.record_checks import RecordsError
-from dreamer_jax.training import NonFiniteError
-from envs import SimulatorError
-from experiments.runs.folder import CELLS, begun, set_aside
-from experiments.runs.memory import OutOfMemoryError, in_memory
-from experiments.runs.run import carry_out, make_run
-from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due
+from experiments.runs.folder import folders
+from experiments.thesis.engines import Engine, Resources, Task
+from experiments.thesis.engines.local import in_turn, one_by_one
+from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due, inspect_run
+from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, Train, set_aside_damaged
+from experiments.thesis.reservations import at_work, reservations
 
 
 @dataclass
@@ -32,181 +21,126 @@ class Progress:
 
     Attributes:
       finished: names of the runs that were trained to their end.
+      shared: those that another process has finished meanwhile.
       failed: those that were not, and why.
       skipped: those that need one of these, and which.
       stopped: whether Ctrl-C ended it.
+      left: whether what is not done is with a queue that goes on by itself.
     """
 
     finished: list[str] = field(default_factory=list)
+    shared: list[str] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     stopped: bool = False
+    left: bool = False
 
     @property
     def complete(self) -> bool:
         """Whether nothing failed and nothing is left."""
         return not (self.failed or self.skipped or self.stopped)
 
-
-Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
-
-
-def train(
-    run: PlannedRun,
-    root: Path,
-    workers: int | None,
-    *,
-    accept_failed: bool = False,
-    timeout: float = envs.SIMULATOR_TIMEOUT,
-    devices: Choice = "all",
-) -> Literal["finished", "stopped"]:
-    """Begins a run or goes on with it, until it is done or stopped.
-
-    Args:
-      run: which one.
-      root: the folder of all results.
-      workers: simulator processes; by default one per core.
-      accept_failed: transfer from agents that failed, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many to spread its members over.
-
-    Raises:
-      ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
-      SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
-    """
-    folder, spec = root / run.name, run.spec
-    lock = FolderLock(folder)
-    if not begun(folder):
-        # Of a run that was stopped before anything was kept, perhaps one of other cells.
-        (folder / "run.json").unlink(missing_ok=True)
-        write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec, devices)
-    try:
-        begins = make_run(
-            spec,
-            folder,
-            resume=True,
-            workers=workers,
-            base=root,
-            accept_failed=accept_failed,
-            timeout=timeout,
-            devices=devices,
-            lock=lock,
-            cells=run.cells,
-        )
-        return carry_out(begins)
-    finally:
-        # The programs of its simulators serve no other run, and take up to 100 MiB a task.
-        jax.clear_caches()
+    def add(self, ending: Ending) -> None:
+        """Notes what became of a run."""
+        self.failed |= ending.damaged
+        match ending.kind:
+            case "finished":
+                self.finished.append(ending.name)
+            case "there":
+                self.shared.append(ending.name)
+            case "failed":
+                self.failed[ending.name] = ending.message
+            case "skipped":
+                self.skipped[ending.name] = ending.message
+            case "stopped" | "left":
+                self.stopped = True
+                self.left |= ending.kind == "left"
 
 
 def carry_out_runs(
     runs: Graph,
     root: str | Path,
     *,
+    engine: Engine = one_by_one,
     workers: int | None = None,
-    train: Train = train,
-    say: Callable[[str], None] = print,
+    accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
+    resources: Callable[[PlannedRun], Resources] = lambda run: Resources(),
+    say: Say = print,
 ) -> Progress:
-    """Trains what is missing and goes on with what was cut, in the order given.
+    """Trains what is missing and goes on with what was cut, each run after those it needs.
 
     Args:
-      runs: from `graph.plan_runs`.
+      runs: from `reservations.planned`, whose context lasts.
       root: the folder of all results.
+      engine: where they are trained; by default here, in the order given.
       workers: simulator processes; by default one per core.
-      train: what trains one run.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many, of those that a run is given, to spread its members over.
+      resources: what a run gets.
       say: where messages go.
-
-    Raises:
-      ValueError: another process trains runs under the same root.
     """
-    root, progress = Path(root), Progress()
+    root, progress = Path(root).absolute(), Progress()
+
+    for run in runs:
+        if isinstance(run, DamagedRun) and (ending := set_aside_damaged(root, run.name)):
+            progress.add(ending)
     left = due(runs)
-    with _alone(root) if left else contextlib.nullcontext():
-        for run in runs:
-            if isinstance(run, DamagedRun):
-                progress.failed[run.name] = _aside(root / run.name, run.problem)
-        _carry_out(left, root, progress, workers, train, say)
+    names = {run.name for run in left}
+    tasks = [
+        Task(
+            Job(root, run.name, workers, accept_failed, timeout, devices),
+            run,
+            tuple(name for name in run.needs if name in names),
+            resources(run),
+            f"run {number} of {len(left)}, {run.name}",
+        )
+        for number, run in enumerate(left, start=1)
+    ]
+    for ending in engine(tasks, say):
+        progress.add(ending)
     return progress
 
 
-@contextlib.contextmanager
-def _alone(root: Path) -> Iterator[None]:
-    """Keeps other processes from training runs under a root, until this one is done or dead."""
-    try:
-        lock = FolderLock(root)
-    except FolderInUseError as error:
-        raise ValueError(
-            f"another command is training in {root} ({error.holder}): wait until it is done, or "
-            "name another folder with --results"
-        ) from None
-    with lock:
-        yield
+def work(
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    accept_failed: bool = False,
+    timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
+    train: Train | None = None,
+    say: Say = print,
+    poll: float = POLL_SECONDS,
+) -> Progress:
+    """Trains what is planned under a root by whomever, and what was cut there, beside others who
+    do the same, until nothing is left.
 
+    Args:
+      root: the folder of all results.
+      workers: simulator processes; by default one per core.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many, of those that a run is given, to spread its members over.
+      train: what trains one run.
+      say: where messages go.
+      poll: seconds between looks at what others do.
+    """
+    root, progress = Path(root).absolute(), Progress()
 
-def _carry_out(
-    left: list[PlannedRun],
-    root: Path,
-    progress: Progress,
-    workers: int | None,
-    train: Train,
-    say: Callable[[str], None],
-) -> None:
-    checked: set[str] = set()
-    for number, run in enumerate(left, start=1):
-        _check_needs(run, root, progress, checked)
-        if broken := [name for name in run.needs if _lost(name, progress)]:
-            progress.skipped[run.name] = f"it needs {', '.join(broken)}"
-            continue
-        verb = f"goes on at {run.progress:.0%}" if run.state == "cut" else "begins"
-        say(f"run {number} of {len(left)}, {run.name}: {_described(run)}; it {verb}")
-        try:
-            outcome = train(run, root, workers)
-        except FolderInUseError as error:
-            progress.failed[run.name] = str(error)
-        except (ValueError, CorruptCheckpointError) as error:
-            damaged = begun(root / run.name)
-            progress.failed[run.name] = (
-                _aside(root / run.name, str(error)) if damaged else str(error)
-            )
-        except (
-            SimulatorError,
-            NonFiniteError,
-            RecordsError,
-            OutOfMemoryError,
-            jax.errors.JaxRuntimeError,
-        ) as error:
-            progress.failed[run.name] = f"{error} (it is kept as it is; the same command goes on)"
-        else:
-            if outcome == "stopped":
-                progress.stopped = True
-                return
-            progress.finished.append(run.name)
+    def tasks() -> list[Task]:
+        planned = reservations(root)
+        # Of copies that hold the same agents, that which plans take.
+        names = {folder for folder, _ in folders(root).values()}
+        runs = {folder.name: inspect_run(folder) for folder in sorted(names)}
+        return [
+            Task(Job(root, run.name, workers, accept_failed, timeout, devices), run, run.needs)
+            for run in due(list({**planned, **runs}.values()))
+        ]
 
-
-def _described(run: PlannedRun) -> str:
-    agents = f"{len(run.cells)} agents" if len(run.cells) > 1 else "1 agent"
-    return f"{agents} on {' + '.join(run.spec.tasks)}"
-
-
-def _lost(name: str, progress: Progress) -> bool:
-    return name in progress.failed or name in progress.skipped
-
-
-def _aside(folder: Path, problem: str) -> str:
-    return f"{problem}; it was set aside as {set_aside(folder).name}, and trains anew next time"
-
-
-def _check_needs(run: PlannedRun, root: Path, progress: Progress, checked: set[str]) -> None:
-    """Reads the newest checkpoint of what a run needs, so that a damaged one is set aside itself
-    and not what would have been made from it."""
-    for name in run.needs:
-        checkpoints = Checkpointer(root / name / "checkpoints")
-        latest = checkpoints.latest()
-        if name in checked or _lost(name, progress) or latest is None:
-            continue
-        try:
-            load_tree(checkpoints.path(latest), subtree="agent/params")
-        except CorruptCheckpointError as error:
-            progress.failed[name] = _aside(root / name, str(error))
-        checked.add(name)
+    with at_work(root):
+        for ending in in_turn(tasks, say, train=train, poll=poll):
+            progress.add(ending)
+    return progress

@@ -1,0 +1,1 @@
+"""Real trainings on real engines, on one machine: see `python -m tests.engines --help`."""
