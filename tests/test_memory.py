@@ -117,8 +117,8 @@ def test_what_the_message_says_is_what_the_run_goes_on_with(tmp_path, monkeypatc
     assert main([*words, "--mapping", "vmap"]) == 1
     message = capsys.readouterr().err
     assert message.startswith("error: a device has no memory left: an update mapped 2 members")
-    (advice,) = [part for part in message.split(". ") if part.startswith("Go on with ")]
-    options = advice.removeprefix("Go on with ").partition(" (")[0].split()
+    (advice,) = [part for part in message.split(". ") if part.startswith("`train` goes on with ")]
+    options = advice.removeprefix("`train` goes on with ").partition(" (")[0].split()
     assert main([*words, *options]) == 130
     assert seen == [("vmap", 1), ("chunks", 1)]
 

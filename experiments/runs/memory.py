@@ -151,6 +151,6 @@ def out_of_memory(run: Run) -> OutOfMemoryError:
     else:
         chunk, why = half, "half as many; fewer if that does not fit either"
     return OutOfMemoryError(
-        f"{told}. Go on with --resume --mapping chunks --mapping-chunk {chunk} ({why}). Else: "
-        f"{others}"
+        f"{told}. `train` goes on with --resume --mapping chunks --mapping-chunk {chunk} ({why}). "
+        f"Else: {others}"
     )
