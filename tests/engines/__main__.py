@@ -142,13 +142,13 @@ def by_workers(folder: Path) -> str:
     process = start(folder, *COMMAND)
     while not list((folder / RESULTS / WORK).glob("*.json")):
         time.sleep(0.1)
-    helpers = [start(folder, "work", str(RESULTS), "--workers", "1") for _ in range(2)]
-    name, pid = in_the_middle(folder, lambda name: "+" in name, [each.pid for each in helpers])
+    others = [start(folder, "work", str(RESULTS), "--workers", "1") for _ in range(2)]
+    name, pid = in_the_middle(folder, lambda name: "+" in name, [each.pid for each in others])
     os.kill(pid, signal.SIGKILL)
     _finish(process, folder)
-    codes = sorted(each.wait(PATIENCE) for each in helpers)
+    codes = sorted(each.wait(PATIENCE) for each in others)
     assert codes == [-9, 0], codes
-    return f"one of two helpers killed during {name}"
+    return f"one of two others killed during {name}"
 
 
 _PARTS: dict[str, Callable[[Path], str]] = {
