@@ -84,17 +84,21 @@ def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
     return jax.vmap(agent.init)(seeds)
 
 
-def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> dict:
-    """Sums of metrics before the first update, [P] each, without running an update."""
-    size = agent.config.network.image_size
-    shape = (batch_size, length)
-    batch = Records(
+def batch_shapes(agent: Agent, batch_size: int, length: int) -> Records:
+    """The shapes of one member's batch, `jax.ShapeDtypeStruct` [B, L, ...]."""
+    shape, size = (batch_size, length), agent.config.network.image_size
+    return Records(
         image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
         action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
         reward=jax.ShapeDtypeStruct(shape, jnp.float32),
         first=jax.ShapeDtypeStruct(shape, jnp.bool_),
         terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
     )
+
+
+def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> dict:
+    """Sums of metrics before the first update, [P] each, without running an update."""
+    batch = batch_shapes(agent, batch_size, length)
     member = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
     metrics = update_member.eval_shape(agent, member, batch)[1]
     members = state.updates.shape[0]

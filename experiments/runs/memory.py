@@ -14,7 +14,7 @@ import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.devices import Choice, place
-from dreamer_jax.records import Records
+from dreamer_jax.population import batch_shapes
 from dreamer_jax.training import Run
 from experiments.runs.agents import make_agent
 from experiments.runs.spec import RunSpec
@@ -30,15 +30,8 @@ class OutOfMemoryError(RuntimeError):
 @functools.cache
 def traced_update(agent: Agent):
     """One member's update, traced for its shapes, and the shapes of its state and its batch."""
-    learning, size = agent.config.learning, agent.config.network.image_size
-    shape = (learning.batch_size, learning.sequence_length)
-    batch = Records(
-        image=jax.ShapeDtypeStruct((*shape, size, size, 3), jnp.uint8),
-        action=jax.ShapeDtypeStruct((*shape, agent.action_size), jnp.float32),
-        reward=jax.ShapeDtypeStruct(shape, jnp.float32),
-        first=jax.ShapeDtypeStruct(shape, jnp.bool_),
-        terminal=jax.ShapeDtypeStruct(shape, jnp.bool_),
-    )
+    learning = agent.config.learning
+    batch = batch_shapes(agent, learning.batch_size, learning.sequence_length)
     state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
     return jax.jit(agent.update).trace(state, batch), state, batch
 

@@ -80,6 +80,11 @@ class Ending:
     damaged: dict[str, str] = field(default_factory=dict)
 
 
+def failed_but_kept(name: str, why: str) -> Ending:
+    """The ending of a run that failed, and whose folder is in order."""
+    return Ending(name, "failed", f"{why} (it is kept as it is; the same command goes on)")
+
+
 def train(
     run: PlannedRun,
     root: Path,
@@ -251,7 +256,7 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
         OutOfMemoryError,
         jax.errors.JaxRuntimeError,
     ) as error:
-        return Ending(name, "failed", f"{error} (it is kept as it is; the same command goes on)")
+        return failed_but_kept(name, str(error))
     if kind == "finished":
         forget(root, name)
     return Ending(name, kind)

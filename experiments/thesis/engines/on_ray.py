@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from experiments.thesis.engines import Resources, Task
-from experiments.thesis.jobs import Ending, Job, Say, perform_elsewhere
+from experiments.thesis.jobs import Ending, Job, Say, failed_but_kept, perform_elsewhere
 
 RETRIES = 10
 """How often a run whose process or machine was lost is begun again; each time it goes on."""
@@ -108,7 +108,7 @@ def _ending(name: str, reference: Any, cancelled: bool) -> Ending:
         if cancelled:
             return Ending(name, "stopped")
         told = str(error).strip().splitlines()[-1]
-        return Ending(name, "failed", f"{told} (it is kept as it is; the same command goes on)")
+        return failed_but_kept(name, told)
 
 
 def _told(ending: Ending) -> str:

@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from experiments.thesis.engines import Engine, Resources, Task
-from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, perform_elsewhere
+from experiments.thesis.jobs import (
+    POLL_SECONDS,
+    Ending,
+    Job,
+    Say,
+    failed_but_kept,
+    perform_elsewhere,
+)
 from experiments.thesis.reservations import WORK
 
 HOURS = 4.0
@@ -173,4 +180,4 @@ def _ending(name: str, job: Any) -> Ending:
         return job.result()
     except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError):
         told = f"job {job.job_id} ended without a word: see {job.paths.stderr}"
-        return Ending(name, "failed", f"{told} (it is kept as it is; the same command goes on)")
+        return failed_but_kept(name, told)
