@@ -187,8 +187,9 @@ class ScheduleConfig:
     given: all of them."""
     replay: Literal["auto", "files", "device"] = "auto"
     """Where updates take records from. Files; or a copy of them in the device's memory, with which
-    a round is one program, if the environment has no host. auto: the device on an accelerator,
-    where that takes at most half of its memory; else files."""
+    the updates of a round are one program (without simulators on the host, its phase is a part of
+    it). auto: the device on an accelerator, where that takes at most half of its memory; else
+    files."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
     """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
     mapping_chunk: int = setting(1, 1, 10**6)

@@ -5,7 +5,9 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,21 @@ from dreamer_jax.freezing import Params
 from dreamer_jax.learning import AgentState
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
+
+
+@dataclass(frozen=True)
+class Member:
+    """One member of a population.
+
+    Attributes:
+      seed: of its parameters, simulators, batches and noise.
+      label: how it is named in messages and metrics.
+      tags: further columns of its metrics (for example omega).
+    """
+
+    seed: int
+    label: str
+    tags: Mapping[str, Any] = field(default_factory=dict)
 
 
 def map_members(function, mapping: str, chunk: int = 1):

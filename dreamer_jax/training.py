@@ -7,11 +7,10 @@ from its last checkpoint gives the same metrics, byte for byte, as one that was 
 Axis letters: P population member, K task, B batch, L sequence length, T ticks in a phase.
 """
 
+import contextlib
 import dataclasses
-import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,50 +21,21 @@ import numpy as np
 from dreamer_jax.agent import Agent, Mode
 from dreamer_jax.device_round import DeviceRounds, on_device
 from dreamer_jax.devices import Placement, on_one_device
-from dreamer_jax.diagnosis import warnings
 from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
-from dreamer_jax.population import Population
+from dreamer_jax.population import Member, Population
 from dreamer_jax.progress import Progress
 from dreamer_jax.record_checks import check_records
 from dreamer_jax.records import Records
-from dreamer_jax.rollout import episodes
 from dreamer_jax.run_folder import RunFolder
+from dreamer_jax.run_rows import RunRows
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.stopping import StopRequest
-from dreamer_jax.video import tile, write_video
 from dreamer_jax.waiting import to_host
-
-MAXIMUM_VIDEO_MEMBERS = 9
-
-
-@dataclass(frozen=True)
-class Member:
-    """One member of a population.
-
-    Attributes:
-      seed: of its parameters, simulators, batches and noise.
-      label: how it is named in messages and metrics.
-      tags: further columns of its metrics (for example omega).
-    """
-
-    seed: int
-    label: str
-    tags: Mapping[str, Any] = field(default_factory=dict)
 
 
 class NonFiniteError(FloatingPointError):
     """All members of a population have met losses or gradients that are not finite."""
-
-
-def _mean(values: Sequence[float]) -> float:
-    """The mean, NaN of nothing."""
-    return float(np.mean(values)) if len(values) else math.nan
-
-
-def _known_mean(scores: Sequence[float]) -> float:
-    """The mean of the scores that are numbers."""
-    return _mean([score for score in scores if not math.isnan(score)])
 
 
 class Run:
@@ -142,10 +112,9 @@ class Run:
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
-        self._one_program, self._replay_note = on_device(
+        self._place = on_device(
             agent, getattr(env, "has_host", True), len(self.tasks), placement.each
         )
-        self.videos = videos
         self.placement = placement
         own_seeds = [member.seed for member in self.members]
         self.population = Population(agent, env, len(self.tasks), own_seeds, placement)
@@ -164,6 +133,7 @@ class Run:
         )
         self.checkpoints, self.replay = self.folder.checkpoints, self.folder.replay
         self.writer = self.folder.writer
+        self._rows = RunRows(self.writer, self.schedule, self.tasks, self.members, videos)
         try:
             self._start(state, from_checkpoint)
         except BaseException:
@@ -173,10 +143,10 @@ class Run:
     def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
         """Takes up what the folder holds, or else the state given, or else fresh agents."""
         agent, population = self.agent, self.population
-        # Where rounds are one program each; None where updates read the files.
+        # Where the replay is on the device; None where updates read the files.
         self.device_rounds = (
             DeviceRounds(agent, self.env, self.replay, population.own_seeds, self.placement)
-            if self._one_program
+            if self._place.device
             else None
         )
         self.counters = Counters()
@@ -187,7 +157,6 @@ class Run:
         self.state = population.fresh() if state is None else population.put(state)
         self.sums = population.zero_sums(self.state)
         self._restore(from_checkpoint)
-        self._warned: set[tuple[int, str]] = set()
 
     def _restore(self, step: int | None = None) -> None:
         """Goes back to a checkpoint, by default the newest, if there is one."""
@@ -226,7 +195,7 @@ class Run:
             self._progress_bar() as self._bar,
             StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
-            for note in (self._devices_note(), self._replay_note):
+            for note in (self._devices_note(), self._place.note):
                 if note:
                     self._bar.message(note)
             if self.checkpoints.latest() is None:
@@ -274,21 +243,6 @@ class Run:
             description=self.directory.name,
         )
 
-    def _advance(self, **counters: int) -> None:
-        self.counters = dataclasses.replace(self.counters, **counters)
-
-    def _columns(self, member: int, rounds: int) -> dict[str, Any]:
-        chosen = self.members[member]
-        return {
-            "member": member,
-            "seed": chosen.seed,
-            "label": chosen.label,
-            **chosen.tags,
-            "env_steps": self.schedule.environment_steps(rounds),
-            "updates": self.counters.updates,
-            "healthy": bool(self._healthy[member]),
-        }
-
     def _phase(self, mode: Mode, phase: int) -> Records:
         started = time.perf_counter()
         if hasattr(self.env, "rest"):
@@ -298,103 +252,103 @@ class Run:
         records = self.placement.own(records)
         self.env.check()
         check_records(records, self.tasks, self._healthy)
-        self._time("evaluate" if mode == "evaluate" else "collect", started)
+        what = "evaluate" if mode == "evaluate" else "collect"
+        self._rows.timed(what, started, self.counters)
         return records
 
     def _round(self, mode: Literal["random", "explore"]) -> None:
         """Collects, and in one program with that makes the updates that are then due, if rounds
         are one program each."""
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
-        if self.device_rounds is None:
+        if not self._place.one_program:
             self._commit(self._phase(mode, self.counters.rounds), mode)
             return
         started, rounds = time.perf_counter(), self.counters.rounds
         updates = range(self.counters.updates, self.schedule.updates_due(rounds + 1))
-        try:
-            self.state, self.sums, records = self.device_rounds.run(
+        with self._used_up() as device_rounds:
+            self.state, self.sums, records = device_rounds.run(
                 self.state, self.sums, rounds, updates, mode
             )
             self.env.check()
             check_records(records, self.tasks, self._healthy)
-            self._time("round", started, updates=len(updates))
+            self._rows.timed("round", started, self.counters, updates=len(updates))
             self._commit(records, mode)
+        if updates:
+            self._updated(updates)
+            self._write_averages()
+
+    @contextlib.contextmanager
+    def _used_up(self) -> Iterator[DeviceRounds]:
+        """For programs that use up the agents: should one fail, those of the newest checkpoint are
+        taken up."""
+        assert self.device_rounds is not None
+        try:
+            yield self.device_rounds
         except Exception:
-            # The agents from before the round are used up.
             self.device_rounds.forget()
             self._restore()
             raise
-        if updates:
-            averaged = self.counters.averaged + len(updates)
-            self._advance(updates=updates.stop, averaged=averaged)
-            self._bar.update(updates=updates.stop)
-            self._write_averages()
 
-    def _commit(self, records: Records, mode: Literal["random", "explore"]) -> None:
+    def _commit(self, records: Records, policy: Literal["random", "explore"]) -> None:
         """Writes a phase to the replay, and what it brought to the metrics."""
-        rounds = self.counters.rounds
+        rounds = self.counters.rounds + 1
         self.replay.append(records)
-        scores = []
-        for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            found = episodes(records.at(member, task)) if self._healthy[member] else []
-            scores.append(_mean([episode.score for episode in found]))
-            row = {
-                "kind": "collect",
-                **self._columns(member, rounds + 1),
-                "task": self.tasks[task],
-                "policy": mode,
-                "episodes": len(found),
-                "return": scores[-1],
-                "length": _mean([episode.length for episode in found]),
-            }
-            self.writer.write(row)
-        self._advance(rounds=rounds + 1)
-        self._bar.update(
-            env_steps=self.schedule.environment_steps(rounds + 1), last_return=_known_mean(scores)
-        )
+        counters = dataclasses.replace(self.counters, rounds=rounds)
+        score = self._rows.collected(records, policy, counters, self._healthy)
+        self.counters = counters
+        self._bar.update(env_steps=self.schedule.environment_steps(rounds), last_return=score)
 
     def _update(self, stop: StopRequest) -> None:
-        """Makes the updates that are due, or those until a stop is requested."""
+        """Makes the updates that are due; from files, those until a stop is requested."""
         self._bar.update(phase="updating")
-        learning = self.agent.config.learning
-        due = self.schedule.updates_due(self.counters.rounds)
         started, before = time.perf_counter(), self.counters.updates
+        due = range(before, self.schedule.updates_due(self.counters.rounds))
+        if self._place.device:
+            with self._used_up() as device_rounds:
+                self.state, self.sums = device_rounds.update(self.state, self.sums, due)
+            self._updated(due)
+        else:
+            self._update_from_files(due, stop)
+        made = self.counters.updates - before
+        self._rows.timed("update", started, self.counters, updates=made)
+        if made == len(due):
+            self._write_averages()
+
+    def _update_from_files(self, due: range, stop: StopRequest) -> None:
+        """Makes updates, one batch after the other, until a stop is requested."""
+        learning = self.agent.config.learning
         loss: jax.Array | None = None
         with self.replay.batches(
-            self.population.own_seeds,
-            range(before, due),
-            learning.batch_size,
-            learning.sequence_length,
+            self.population.own_seeds, due, learning.batch_size, learning.sequence_length
         ) as batches:
-            for update, batch in enumerate(batches, start=before):
+            for update, batch in zip(due, batches, strict=True):
                 previous = loss
                 self.state, self.sums, loss = self.population.update(self.state, self.sums, batch)
                 # One update ahead of the device, no more: the next batch is being prepared.
                 jax.block_until_ready(previous)
-                self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
-                self._bar.update(updates=update + 1)
+                self._updated(range(update, update + 1))
                 if stop.requested:
                     break
         jax.block_until_ready(loss)
-        self._time("update", started, updates=self.counters.updates - before)
-        if self.counters.updates == due:
-            self._write_averages()
+
+    def _updated(self, updates: range) -> None:
+        """Counts updates with these numbers, which have been made."""
+        averaged = self.counters.averaged + len(updates)
+        self.counters = dataclasses.replace(self.counters, updates=updates.stop, averaged=averaged)
+        self._bar.update(updates=updates.stop)
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
         healthy = np.array(self.placement.own(self.state.healthy))
         newly_frozen = np.flatnonzero(self._healthy & ~healthy).tolist()
         self._healthy = healthy
-        for member in range(len(self.members)):
-            averages = {name: float(x[member]) / count for name, x in sums.items()}
-            row = {"kind": "update", **self._columns(member, self.counters.rounds), **averages}
-            self.writer.write(row)
-            self._warn(member, averages)
+        averages = {name: np.asarray(x, np.float64) / count for name, x in sums.items()}
+        learning, say = self.agent.config.learning, self._bar.message
+        self._rows.updated(averages, self.counters, healthy, learning, say)
         for member in newly_frozen:
-            chosen = self.members[member]
-            self._bar.message(
-                f"member {member} ({chosen.label}, seed {chosen.seed}) met a loss or gradient that "
-                f"is not finite by update {self.counters.updates}: it is frozen as it was before, "
-                "the others go on"
+            say(
+                f"{self._rows.named(member)} met a loss or gradient that is not finite by update "
+                f"{self.counters.updates}: it is frozen as it was before, the others go on"
             )
         self.sums = jax.tree.map(jnp.zeros_like, self.sums)
         self.counters = dataclasses.replace(self.counters, averaged=0)
@@ -405,60 +359,15 @@ class Run:
                 "rates or the gradient norm. The last healthy parameters are in its checkpoint"
             )
 
-    def _warn(self, member: int, averages: Mapping[str, float]) -> None:
-        """Says once for each member what keeps it from learning."""
-        found = warnings(averages, self.agent.config.learning, self.counters.updates)
-        for name, message in found.items():
-            if (member, name) not in self._warned:
-                self._warned.add((member, name))
-                chosen = self.members[member]
-                self._bar.message(
-                    f"member {member} ({chosen.label}, seed {chosen.seed}), update "
-                    f"{self.counters.updates}: {message}"
-                )
-
     def _evaluate(self) -> None:
         """One episode per task and member: the mode, without noise, up to the first fall."""
         self._bar.update(phase="evaluating")
         index = self.counters.evaluations + 1
         records = self._phase("evaluate", index)
         diagnosis = jax.device_get(self.population.diagnose(self.state.params, records, index))
-        scores = []
-        for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            healthy, episode = bool(self._healthy[member]), episodes(records.at(member, task))[0]
-            knowledge = {name: float(x[member, task]) for name, x in diagnosis.items()}
-            scores.append(episode.score if healthy else math.nan)
-            row = {
-                "kind": "evaluation",
-                **self._columns(member, self.counters.rounds),
-                "task": self.tasks[task],
-                "return": scores[-1],
-                "length": episode.length if healthy else 0,
-                "fell": healthy and episode.fell,
-                **(knowledge if healthy else dict.fromkeys(knowledge, math.nan)),
-            }
-            self.writer.write(row)
-        evaluations = self.schedule.evaluations
-        stride = max(1, evaluations // max(1, self.videos))
-        if self.videos and (index % stride == 0 or index == evaluations):
-            self._write_video(records)
+        score = self._rows.evaluated(records, diagnosis, self.counters, self._healthy)
         # A long round may cross several multiples; they share one evaluation.
         steps = self.schedule.environment_steps(self.counters.rounds)
-        self._advance(evaluations=steps // self.schedule.config.evaluate_every)
-        self._bar.update(last_return=_known_mean(scores))
-
-    def _write_video(self, records: Records) -> None:
-        frames = records.image[:MAXIMUM_VIDEO_MEMBERS]
-        frames = frames.reshape(-1, *frames.shape[2:])
-        steps = self.schedule.environment_steps(self.counters.rounds)
-        path = self.directory / "videos" / f"evaluation_{steps:09d}.mp4"
-        write_video(path, tile(frames), fps=30)
-
-    def _time(self, what: str, started: float, **columns) -> None:
-        row = {
-            "kind": what,
-            "seconds": time.perf_counter() - started,
-            "env_steps": self.schedule.environment_steps(self.counters.rounds),
-            **columns,
-        }
-        self.writer.write_timing(row)
+        evaluations = steps // self.schedule.config.evaluate_every
+        self.counters = dataclasses.replace(self.counters, evaluations=evaluations)
+        self._bar.update(last_return=score)

@@ -181,6 +181,17 @@ def test_an_estimate_is_what_can_be_counted_by_hand(tmp_path):
     assert records < found.disk < records + 2 * 6 * 10**6
 
 
+def test_a_replay_on_the_device_counts_as_its_memory(tmp_path):
+    _, run, *_ = plan(tmp_path)
+    config = run.spec.config
+    schedule = dataclasses.replace(config.schedule, replay="device")
+    spec = dataclasses.replace(run.spec, config=dataclasses.replace(config, schedule=schedule))
+    device = dataclasses.replace(run, spec=spec)
+    more = estimate.estimate(device, SPEED).memory - estimate.estimate(run, SPEED).memory
+    # The same records as on the disk.
+    assert more == 6 * 4 * 21 * (32 * 32 * 3 + 4 * 3 + 4 + 2)
+
+
 def test_time_is_linear_in_each_speed_and_falls_with_what_is_done(tmp_path):
     _, targets, *_ = plan(tmp_path)
 

@@ -17,7 +17,7 @@ from experiments.methods.base import Method, require
 from experiments.methods.scratch import Scratch
 
 if TYPE_CHECKING:
-    from dreamer_jax.training import Member
+    from dreamer_jax.population import Member
 
 OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
 """How members are mapped depends on the machine and changes no result but by rounding."""
