@@ -178,6 +178,11 @@ class ScheduleConfig:
     """Phases of random actions before the first update (several tasks: 1 phase of each)."""
     updates_per_phase: int = setting(100, 0, 10**6)
     """Updates for each phase collected."""
+    collect: Literal["before", "beside"] = "before"
+    """When a phase is collected. before: between updates, with the newest policy, as the thesis
+    does. beside: on a thread, beside the updates of the round before it and with the policy from
+    before them, so that simulators on the host and the device do not wait for one another; a round
+    is then the least that can be stopped."""
     evaluate_every: int = setting(10_000, 1, 10**12)
     """Environment steps between evaluations."""
     checkpoint_every: int = setting(10_000, 1, 10**12)

@@ -62,7 +62,7 @@ def on_device(agent: Agent, has_host: bool, tasks: int, members: int) -> ReplayP
     Args:
       agent: its functions and settings.
       has_host: whether anything of the environment runs on the host; then phases are programs of
-        their own.
+        their own, as they are where they are collected beside updates.
       tasks: K.
       members: P, of those on one device.
 
@@ -90,7 +90,8 @@ def on_device(agent: Agent, has_host: bool, tasks: int, members: int) -> ReplayP
             f"replay=device would take {takes}, and the device has {_size(memory)}: keep fewer "
             f"records of each task (replay_keep, less than {fits}), or choose replay=files"
         )
-    return ReplayPlace(True, not has_host, f"replay on the device: {takes}")
+    one_program = not has_host and agent.config.schedule.collect == "before"
+    return ReplayPlace(True, one_program, f"replay on the device: {takes}")
 
 
 def replay_bytes(agent: Agent, tasks: int, members: int) -> int:

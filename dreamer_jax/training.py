@@ -19,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer_jax.agent import Agent, Mode
+from dreamer_jax.ahead import PhaseAhead, on_thread
 from dreamer_jax.device_round import DeviceRounds, on_device
 from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
-from dreamer_jax.population import Member, Population
+from dreamer_jax.population import Member, Population, check_environment
 from dreamer_jax.progress import Progress
 from dreamer_jax.record_checks import check_records
 from dreamer_jax.records import Records
@@ -87,27 +88,7 @@ class Run:
             raise ValueError(
                 f"{placement.members} members are placed, {len(members)} are named: place as many"
             )
-        if (shards := getattr(env, "shards", 1)) != placement.count:
-            raise ValueError(
-                f"the environment is made for {shards} devices, the members lie on "
-                f"{placement.count}: build it with shards={placement.count}"
-            )
-        if env.action_size != agent.action_size:
-            raise ValueError(
-                f"the environment takes actions of size {env.action_size}, the agent gives "
-                f"{agent.action_size}: build both for the same tasks"
-            )
-        if env.discrete != agent.discrete:
-            kinds = ["discrete" if x.discrete else "continuous" for x in (env, agent)]
-            raise ValueError(
-                f"the environment takes {kinds[0]} actions, the agent gives {kinds[1]} ones: "
-                "build both for the same tasks"
-            )
-        if env.image_size != config.network.image_size:
-            raise ValueError(
-                f"the environment renders {env.image_size} pixels, the agent reads "
-                f"{config.network.image_size}: build both with the same image_size"
-            )
+        check_environment(agent, env, placement)
         self.agent, self.env = agent, env
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
@@ -150,6 +131,8 @@ class Run:
             else None
         )
         self.counters = Counters()
+        # What is collected beside updates and not committed yet.
+        self._ahead: PhaseAhead | None = None
         if state is not None and state.updates.shape != (len(self.members),):
             raise ValueError(
                 f"the state holds {state.updates.shape} members, {len(self.members)} are named"
@@ -173,6 +156,13 @@ class Run:
         """Writes a checkpoint of everything that a resumed run needs."""
         tree = self.placement.own({"agent": self.state, "sums": self.sums})
         self.folder.save(self._step(), tree, dataclasses.asdict(self.counters))
+        self._saved_steps = self.schedule.environment_steps(self.counters.rounds)
+
+    def _save_if_due(self) -> None:
+        every = self.schedule.config.checkpoint_every
+        steps = self.schedule.environment_steps(self.counters.rounds)
+        if steps // every > self._saved_steps // every:
+            self.save()
 
     def _step(self) -> int:
         """A number that grows with every action."""
@@ -200,13 +190,14 @@ class Run:
                     self._bar.message(note)
             if self.checkpoints.latest() is None:
                 self.save()
-            saved_steps = schedule.environment_steps(self.counters.rounds)
-            while (action := schedule.next(self.counters)) != "done" and not stop.requested:
-                steps = schedule.environment_steps(self.counters.rounds)
-                every = schedule.config.checkpoint_every
-                if action == "collect" and steps // every > saved_steps // every:
-                    self.save()
-                    saved_steps = steps
+            self._saved_steps = schedule.environment_steps(self.counters.rounds)
+            # A phase that is collected ahead belongs to its round: both are done, or none is.
+            while (action := schedule.next(self.counters)) != "done" and (
+                self._ahead or not stop.requested
+            ):
+                ahead = self._ahead is not None
+                if action == "collect" and not ahead:
+                    self._save_if_due()
                 try:
                     if action == "update":
                         self._update(stop)
@@ -218,11 +209,14 @@ class Run:
                     raise
                 except Exception as error:
                     # Nothing of the failed action has been committed.
+                    self._take_back()
                     self.save()
                     if not stop.requested:
                         raise
-                    self._bar.message(f"this phase is given up: {error}")  # type: ignore[unreachable]
+                    self._bar.message(f"this phase is given up: {error}")
                     return "stopped"
+                if action == "collect" and ahead:
+                    self._save_if_due()
             self.save()
         return "finished" if action == "done" else "stopped"
 
@@ -244,11 +238,17 @@ class Run:
         )
 
     def _phase(self, mode: Mode, phase: int) -> Records:
-        started = time.perf_counter()
+        self._let_rest()
+        return self._played(self.state, mode, phase)
+
+    def _let_rest(self) -> None:
         if hasattr(self.env, "rest"):
             # A frozen member learns nothing from what it would play.
             self.env.rest(np.repeat(~self._healthy, len(self.tasks)))
-        records = to_host(self.population.collect(self.state, phase, mode))
+
+    def _played(self, state: AgentState, mode: Mode, phase: int) -> Records:
+        started = time.perf_counter()
+        records = to_host(self.population.collect(state, phase, mode))
         records = self.placement.own(records)
         self.env.check()
         check_records(records, self.tasks, self._healthy)
@@ -257,8 +257,12 @@ class Run:
         return records
 
     def _round(self, mode: Literal["random", "explore"]) -> None:
-        """Collects, and in one program with that makes the updates that are then due, if rounds
-        are one program each."""
+        """Collects, or takes what was collected ahead; and in one program with that makes the
+        updates that are then due, if rounds are one program each."""
+        if self._ahead is not None:
+            self._commit(self._ahead.records.result(), mode)
+            self._ahead = None
+            return
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
         if not self._place.one_program:
             self._commit(self._phase(mode, self.counters.rounds), mode)
@@ -279,15 +283,35 @@ class Run:
 
     @contextlib.contextmanager
     def _used_up(self) -> Iterator[DeviceRounds]:
-        """For programs that use up the agents: should one fail, those of the newest checkpoint are
-        taken up."""
+        """For programs that use up the agents: should one fail, those that are kept, or else those
+        of the newest checkpoint, are taken up."""
         assert self.device_rounds is not None
         try:
             yield self.device_rounds
         except Exception:
             self.device_rounds.forget()
-            self._restore()
+            if self._ahead is None:
+                self._restore()
+            else:
+                self._take_back()
             raise
+
+    def _collect_ahead(self) -> PhaseAhead:
+        """Begins to collect the next phase, with the policy as it is."""
+        state, sums = self.population.copied((self.state, self.sums))
+        self._let_rest()
+        records = on_thread(self._played, state, "explore", self.counters.rounds)
+        offset = self.writer.offset()
+        return PhaseAhead(records, state, sums, self.counters, self._healthy, offset)
+
+    def _take_back(self) -> None:
+        """Makes the run what it was before a phase that is collected ahead, if there is one."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            ahead.wait()
+            self.state, self.sums, self.counters = ahead.state, ahead.sums, ahead.counters
+            self._healthy = ahead.healthy
+            self.writer.truncate(ahead.metrics)
 
     def _commit(self, records: Records, policy: Literal["random", "explore"]) -> None:
         """Writes a phase to the replay, and what it brought to the metrics."""
@@ -299,8 +323,18 @@ class Run:
         self._bar.update(env_steps=self.schedule.environment_steps(rounds), last_return=score)
 
     def _update(self, stop: StopRequest) -> None:
-        """Makes the updates that are due; from files, those until a stop is requested."""
-        self._bar.update(phase="updating")
+        """Makes the updates that are due, perhaps with the next phase collected beside them; from
+        files and without a phase, those until a stop is requested."""
+        rounds, schedule = self.counters.rounds, self.schedule
+        # The first phase after the random ones is for a policy that has been trained.
+        if (
+            schedule.config.collect == "beside"
+            and schedule.prefill_rounds < rounds < schedule.rounds
+        ):
+            self._bar.update(phase="updating and collecting")
+            self._ahead = self._collect_ahead()
+        else:
+            self._bar.update(phase="updating")
         started, before = time.perf_counter(), self.counters.updates
         due = range(before, self.schedule.updates_due(self.counters.rounds))
         if self._place.device:
@@ -311,6 +345,8 @@ class Run:
             self._update_from_files(due, stop)
         made = self.counters.updates - before
         self._rows.timed("update", started, self.counters, updates=made)
+        if self._ahead is not None:
+            self._ahead.records.result()
         if made == len(due):
             self._write_averages()
 
@@ -327,7 +363,7 @@ class Run:
                 # One update ahead of the device, no more: the next batch is being prepared.
                 jax.block_until_ready(previous)
                 self._updated(range(update, update + 1))
-                if stop.requested:
+                if stop.requested and self._ahead is None:
                     break
         jax.block_until_ready(loss)
 

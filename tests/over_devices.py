@@ -135,14 +135,15 @@ def assert_spread(tree, placement):
 
 
 def the_number_of_devices_does_not_matter(folder):
-    """In files, on the device, and both with simulators on the host."""
-    for name, replay, make_env in (
-        ("files", "files", probe),
-        ("device", "device", probe),
-        ("host", "files", counting),
-        ("host-device", "device", counting),
+    """In files, on the device, both with simulators on the host, and these beside updates."""
+    for name, replay, make_env, collect in (
+        ("files", "files", probe, "before"),
+        ("device", "device", probe, "before"),
+        ("host", "files", counting, "before"),
+        ("host-device", "device", counting, "before"),
+        ("host-beside", "device", counting, "beside"),
     ):
-        agent = Small(config_with(replay=replay), 2)
+        agent = Small(config_with(replay=replay, collect=collect), 2)
         counts = (1, 8) if make_env is counting else (1, 2, 4, 8)
         for devices in counts:
             run = trained(folder / f"{name}-{devices}", 8, devices, agent, make_env)
