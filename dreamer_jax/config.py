@@ -195,6 +195,9 @@ class ScheduleConfig:
     the updates of a round are one program (without simulators on the host, its phase is a part of
     it). auto: the device on an accelerator, where that takes at most half of its memory; else
     files."""
+    replay_threads: int | None = setting(None, 1, 256)
+    """Threads that put a batch together from files; none given: 4, or as many as there are cores if
+    these are fewer."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
     """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
     mapping_chunk: int = setting(1, 1, 10**6)

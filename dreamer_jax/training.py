@@ -110,6 +110,7 @@ class Run:
                 "image_size": config.network.image_size,
                 "action_size": agent.action_size,
                 "keep": config.schedule.replay_keep,
+                "threads": config.schedule.replay_threads,
             },
         )
         self.checkpoints, self.replay = self.folder.checkpoints, self.folder.replay
