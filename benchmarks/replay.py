@@ -1,14 +1,15 @@
 """Memory and speed of the replay at full size: a million environment steps of each member.
 
     python -m benchmarks.replay [records=500000] [P=3] [image_size=64] [actions=8] [B=50] [L=50]
-                                [batches=50] [threads=0] [directory=/tmp]
+                                [batches=50] [threads=0] [keep=0] [directory=/tmp]
 
 Writes random records into a new folder in `directory` (18 GB by default), samples batches from
 them, and removes the folder. Prints one line of JSON: "anonymous_gib" is by how much the memory of
 the process grew that no file stands behind, at its largest; "seconds_per_batch" are of one batch
 for all members, put together by so many `threads` (0: as a run does by itself), "cold" right after
 the page cache was told to drop the files, "warm" after as many batches of other places in them.
-Freed memory is kept, as a run keeps it.
+With keep=1 freed memory is kept, as a run does: batches then take no new pages, and the last one's
+memory counts as grown.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ DEFAULTS = {
     "L": 50,
     "batches": 50,
     "threads": 0,
+    "keep": 0,
     "directory": tempfile.gettempdir(),
 }
 PHASE = 1000
@@ -95,7 +97,8 @@ def main(arguments: list[str]) -> None:
         sys.exit(f"got {sorted(unknown)}, expected names among {list(DEFAULTS)}")
     settings = DEFAULTS | {name: type(DEFAULTS[name])(value) for name, value in given.items()}
     batch, length, batches = settings["B"], settings["L"], settings["batches"]
-    keep_freed_memory()
+    if settings["keep"]:
+        keep_freed_memory()
     with tempfile.TemporaryDirectory(dir=settings["directory"]) as directory:
         replay = Replay(
             directory,
