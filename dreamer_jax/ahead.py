@@ -40,6 +40,11 @@ class PhaseAhead:
     healthy: np.ndarray
     metrics: int
 
+    @property
+    def failed(self) -> bool:
+        """Whether it is known by now that there will be no records."""
+        return self.records.done() and self.records.exception() is not None
+
     def wait(self) -> None:
         """Until the thread is done with the environment, however that ended."""
         concurrent.futures.wait([self.records])
@@ -47,7 +52,7 @@ class PhaseAhead:
 
 def on_thread(function: Callable[..., Any], *arguments: Any) -> concurrent.futures.Future:
     """Calls a function on a thread of its own."""
-    with_one = concurrent.futures.ThreadPoolExecutor(max_workers=1, thread_name_prefix="collect")
-    future = with_one.submit(function, *arguments)
-    with_one.shutdown(wait=False)
+    pool = concurrent.futures.ThreadPoolExecutor(max_workers=1, thread_name_prefix="collect")
+    future = pool.submit(function, *arguments)
+    pool.shutdown(wait=False)  # the thread ends when it is done
     return future

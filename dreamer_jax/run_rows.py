@@ -6,7 +6,6 @@ Axis letters: P population member, K task, T ticks in a phase.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -175,16 +174,11 @@ class RunRows:
             write_video(folder / f"evaluation_{steps:09d}.mp4", tile(frames), fps=30)
         return _known_mean(scores)
 
-    def timed(self, what: str, started: float, counters: Counters, **columns: int) -> None:
-        """How long something took, that began at `started` of `time.perf_counter`."""
-        self._writer.write_timing(
-            {
-                "kind": what,
-                "seconds": time.perf_counter() - started,
-                "env_steps": self._schedule.environment_steps(counters.rounds),
-                **columns,
-            }
-        )
+    def timed(self, what: str, seconds: float, counters: Counters, **columns: int) -> None:
+        """How long something took."""
+        steps = self._schedule.environment_steps(counters.rounds)
+        row = {"kind": what, "seconds": seconds, "env_steps": steps, **columns}
+        self._writer.write_timing(row)
 
 
 def _mean(values: Sequence[float]) -> float:

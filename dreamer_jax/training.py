@@ -179,7 +179,8 @@ class Run:
 
         Raises:
           NonFiniteError: no member is healthy any more; what was collected is saved.
-          Exception: what a simulator met; the run is saved as it was before that phase.
+          Exception: what a simulator met; the run is saved as it was before that phase, and before
+            the updates beside it.
         """
         schedule = self.schedule
         with (
@@ -254,7 +255,7 @@ class Run:
         self.env.check()
         check_records(records, self.tasks, self._healthy)
         what = "evaluate" if mode == "evaluate" else "collect"
-        self._rows.timed(what, started, self.counters)
+        self._rows.timed(what, time.perf_counter() - started, self.counters)
         return records
 
     def _round(self, mode: Literal["random", "explore"]) -> None:
@@ -276,7 +277,8 @@ class Run:
             )
             self.env.check()
             check_records(records, self.tasks, self._healthy)
-            self._rows.timed("round", started, self.counters, updates=len(updates))
+            seconds = time.perf_counter() - started
+            self._rows.timed("round", seconds, self.counters, updates=len(updates))
             self._commit(records, mode)
         if updates:
             self._updated(updates)
@@ -344,15 +346,16 @@ class Run:
             self._updated(due)
         else:
             self._update_from_files(due, stop)
-        made = self.counters.updates - before
-        self._rows.timed("update", started, self.counters, updates=made)
+        made, seconds = self.counters.updates - before, time.perf_counter() - started
         if self._ahead is not None:
             self._ahead.records.result()
+        self._rows.timed("update", seconds, self.counters, updates=made)
         if made == len(due):
             self._write_averages()
 
     def _update_from_files(self, due: range, stop: StopRequest) -> None:
-        """Makes updates, one batch after the other, until a stop is requested."""
+        """Makes updates, one batch after the other, until a stop is requested; or, with a phase
+        beside them, until that has failed."""
         learning = self.agent.config.learning
         loss: jax.Array | None = None
         with self.replay.batches(
@@ -364,7 +367,7 @@ class Run:
                 # One update ahead of the device, no more: the next batch is being prepared.
                 jax.block_until_ready(previous)
                 self._updated(range(update, update + 1))
-                if stop.requested and self._ahead is None:
+                if stop.requested if self._ahead is None else self._ahead.failed:
                     break
         jax.block_until_ready(loss)
 

@@ -178,7 +178,7 @@ def test_a_run_killed_in_the_midst_of_a_round_equals_one_that_was_not(
     with monkeypatch.context() as patch, pytest.raises(Killed):
         in_update(patch, agent, first_update(agent, 3) - earlier, raising(Killed()))
         run.train()
-    run._ahead.wait() if run._ahead else None  # as the process would be gone
+    run._ahead.wait()  # a process that is killed takes its thread along
     run.close()
     assert_goes_on_as(finished, tmp_path, agent)
 
@@ -215,6 +215,25 @@ def test_a_simulator_that_dies_leaves_the_run_as_it_was_before_the_round(
     assert (run.counters.rounds, run.counters.updates) == (3, 4)
     assert not [x for x in threading.enumerate() if x.name.startswith("collect")]
     assert_goes_on_as(finished, tmp_path, agent)
+
+
+def test_no_more_batches_are_learned_from_once_the_phase_beside_them_has_failed(
+    tmp_path, monkeypatch
+):
+    agent, made = agent_with("files"), []
+    run, update = run_in(tmp_path, agent, env=Broken(2, on_thread=True)), population.update_members
+
+    def counting(*arguments, **options):
+        made.append(len(made))
+        if len(made) == first_update(agent, 3):
+            run._ahead.wait()
+        return update(*arguments, **options)
+
+    monkeypatch.setattr(population, "update_members", counting)
+    with pytest.raises(RuntimeError, match="probe/point died"):
+        run.train()
+    run.close()
+    assert len(made) == first_update(agent, 3)
 
 
 def test_a_simulator_given_up_after_ctrl_c_is_told_and_ends_the_run_before_the_round(
