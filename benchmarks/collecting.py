@@ -1,13 +1,14 @@
 """Seconds of a round with its phase collected before updates and beside them: one JSON line.
 
     python -m benchmarks.collecting [task=bullet/inverted_pendulum] [preset=cpu] [P=1] [rounds=3]
-                                    [turns=3] [updates=0] [workers=1] [wait_ms=0]
+                                    [turns=3] [phase=1000] [updates=0] [workers=1] [wait_ms=0]
 
 Real runs in temporary folders, of either kind in turns; `before` and `beside` are a round's mean
 seconds of each turn, from the first phase with a trained policy on, and `ratio` the median over
 turns of beside over before. Where all shares one core there is nothing to gain but what
 simulators wait: `wait_ms` are milliseconds that each tick of all simulators sleeps, in place of
-simulators on cores of their own. `updates` of a round, by default the preset's.
+simulators on cores of their own. `phase` has so many environment steps; `updates` are those of a
+round, by default the preset's.
 """
 
 import contextlib
@@ -34,6 +35,7 @@ DEFAULTS = {
     "P": 1,
     "rounds": 3,
     "turns": 3,
+    "phase": 1000,
     "updates": 0,
     "workers": 1,
     "wait_ms": 0.0,
@@ -47,7 +49,8 @@ def seconds_of_a_round(a: dict, collect: str, directory: Path) -> float:
     config = preset(a["preset"])
     schedule = dataclasses.replace(
         config.schedule,
-        environment_steps=(1 + WARM + a["rounds"]) * config.schedule.phase_environment_steps,
+        environment_steps=(1 + WARM + a["rounds"]) * a["phase"],
+        phase_environment_steps=a["phase"],
         prefill_phases=1,
         updates_per_phase=a["updates"] or config.schedule.updates_per_phase,
         evaluate_every=10**9,
