@@ -88,7 +88,7 @@ def sample_of(agent: Agent) -> tuple[Agent, float]:
       times the arithmetic of its update the given agent's is. The agent itself and 1, where its
       update is small.
     """
-    whole = _operations(agent)
+    whole = operations(agent)
     if whole <= SAMPLE_OPERATIONS:
         return agent, 1.0
     learning = agent.config.learning
@@ -101,11 +101,11 @@ def sample_of(agent: Agent) -> tuple[Agent, float]:
     )
     config = dataclasses.replace(agent.config, learning=learning)
     part = dataclasses.replace(agent, config=config)
-    return part, whole / _operations(part)
+    return part, whole / operations(part)
 
 
-def _operations(agent: Agent) -> float:
-    """Of one member's update."""
+def operations(agent: Agent) -> float:
+    """Arithmetic operations of one member's update."""
     return flops.of_jaxpr(traced_update(agent)[0].jaxpr.jaxpr)
 
 
