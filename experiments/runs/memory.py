@@ -14,7 +14,7 @@ import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.devices import Choice, place
-from dreamer_jax.population import batch_shapes
+from dreamer_jax.population import batch_shapes, update_member
 from dreamer_jax.training import Run
 from experiments.runs.agents import make_agent
 from experiments.runs.spec import RunSpec
@@ -33,7 +33,8 @@ def traced_update(agent: Agent):
     learning = agent.config.learning
     batch = batch_shapes(agent, learning.batch_size, learning.sequence_length)
     state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
-    return jax.jit(agent.update).trace(state, batch), state, batch
+    # What maps it over members shares the trace.
+    return update_member.trace(agent, state, batch), state, batch
 
 
 @functools.cache

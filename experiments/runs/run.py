@@ -42,7 +42,7 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _revision() -> str:
+def revision() -> str:
     """The commit of the source tree, marked if it was changed since; else the package's version."""
     tree = Path(__file__).parents[2]
     if (tree / ".git").exists():
@@ -117,7 +117,7 @@ def make_run(
         # Written last: what has a header can be resumed.
         if not (directory / "run.json").exists():
             named = {"cells": list(cells)} if cells else {}
-            made_with = {"versions": _versions(), "revision": _revision()}
+            made_with = {"versions": _versions(), "revision": revision()}
             content = {"spec": spec.to_dict(), **named, **made_with}
             write_sealed_json(directory / "run.json", content)
         return Run(
