@@ -12,7 +12,7 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
-from experiments.cli.options import Devices, Simulators
+from experiments.cli.options import AtOnce, Devices, Simulators
 
 if TYPE_CHECKING:
     from experiments.thesis.engines import Engine
@@ -58,6 +58,7 @@ class Work:
     """The folder that holds the runs, such as results/cpu."""
     devices: Devices = setting("all", 1, 10_000)
     """Devices to spread members over, each member on one of them."""
+    at_once: tyro.conf.OmitArgPrefixes[AtOnce] = AtOnce()
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
@@ -168,6 +169,8 @@ def work(command: Work) -> int:
         accept_failed=command.accept_failed,
         timeout=command.simulators.simulator_timeout,
         devices=command.devices,
+        mapping=command.at_once.mapping,
+        mapping_chunk=command.at_once.mapping_chunk,
     )
     if progress.stopped:
         print("stopped and saved: the same command goes on")

@@ -218,10 +218,8 @@ def train(command: Train) -> int:
 
     keep_freed_memory()
     with usage_errors():
-        if spec.config.schedule.mapping == "auto":
-            spec = in_memory(spec, run.devices)
         begun = make_run(
-            spec,
+            in_memory(spec, run.devices),
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.simulators.workers,

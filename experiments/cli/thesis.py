@@ -295,6 +295,8 @@ def _carry_out(
                 **engine_options(execution, wanted, sweep.simulators),
                 accept_failed=sweep.accept_failed,
                 devices=sweep.devices,
+                mapping=sweep.config.schedule.mapping,
+                mapping_chunk=sweep.config.schedule.mapping_chunk,
             )
     if progress.stopped and not progress.left:
         print(f"stopped and saved in {sweep.root}: the same command goes on")

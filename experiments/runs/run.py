@@ -28,6 +28,7 @@ from experiments.runs.agents import make_agent, make_env
 from experiments.runs.memory import is_exhausted, out_of_memory
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.runs.start import load_sources, transferred_members
+from experiments.runs.ways_out import TRAIN, WaysOut
 
 
 def _versions() -> dict[str, str]:
@@ -184,8 +185,12 @@ def _plain(value):
     return np.asarray(value).tolist()
 
 
-def carry_out(run: Run) -> Literal["finished", "stopped"]:
+def carry_out(run: Run, ways: WaysOut = TRAIN) -> Literal["finished", "stopped"]:
     """Trains to the end or to Ctrl-C, and closes the run and its simulators.
+
+    Args:
+      run: the run.
+      ways: what to do about a device without memory, in the words of what was called.
 
     Raises:
       OutOfMemoryError: a device has no memory left; names what may fit.
@@ -196,7 +201,7 @@ def carry_out(run: Run) -> Literal["finished", "stopped"]:
     except (jax.errors.JaxRuntimeError, MemoryError) as error:
         if not is_exhausted(error):
             raise
-        raise out_of_memory(run) from error
+        raise out_of_memory(run, ways) from error
     finally:
         run.close()
         run.env.close()

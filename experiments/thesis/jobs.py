@@ -27,8 +27,10 @@ from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
 from experiments.runs.folder import CELLS, begun, set_aside
-from experiments.runs.memory import OutOfMemoryError, in_memory
+from experiments.runs.memory import OutOfMemoryError, in_memory, mapped
 from experiments.runs.run import carry_out, make_run
+from experiments.runs.spec import Mapped
+from experiments.runs.ways_out import GRID, WaysOut
 from experiments.thesis.graph import DamagedRun, PlannedRun, inspect_run
 from experiments.thesis.reservations import at_work, claim, forget, reserved
 from experiments.thesis.speeds import cache_folder
@@ -51,6 +53,9 @@ class Job:
       accept_failed: take sources whose losses were not finite any more, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
       devices: how many to spread its members over.
+      mapping, mapping_chunk: how they are mapped there; "auto" asks the device's memory, whatever
+        was right where the run was begun.
+      ways: what to do about a device without memory, in the words of what was called.
     """
 
     root: Path
@@ -59,6 +64,9 @@ class Job:
     accept_failed: bool = False
     timeout: float = envs.SIMULATOR_TIMEOUT
     devices: Choice = "all"
+    mapping: Mapped = "auto"
+    mapping_chunk: int = 1
+    ways: WaysOut = GRID
 
 
 @dataclass(frozen=True)
@@ -93,6 +101,9 @@ def train(
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
     devices: Choice = "all",
+    mapping: Mapped = "auto",
+    mapping_chunk: int = 1,
+    ways: WaysOut = GRID,
 ) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
@@ -102,22 +113,22 @@ def train(
       workers: simulator processes; by default one per core.
       accept_failed: transfer from agents that failed, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many to spread its members over.
+      devices, mapping, mapping_chunk, ways: see `Job`.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
+      OutOfMemoryError: a device has no memory left.
       SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
     """
-    folder, spec = root / run.name, run.spec
+    folder = root / run.name
     lock = FolderLock(folder)
     if not begun(folder):
         # Of a run that was stopped before anything was kept, perhaps one of other cells.
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec, devices)
     try:
         begins = make_run(
-            spec,
+            in_memory(mapped(run.spec, mapping, mapping_chunk), devices),
             folder,
             resume=True,
             workers=workers,
@@ -128,7 +139,7 @@ def train(
             lock=lock,
             cells=run.cells,
         )
-        return carry_out(begins)
+        return carry_out(begins, ways)
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
@@ -240,6 +251,9 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
             accept_failed=job.accept_failed,
             timeout=job.timeout,
             devices=job.devices,
+            mapping=job.mapping,
+            mapping_chunk=job.mapping_chunk,
+            ways=job.ways,
         )
     begins(run)
     try:
@@ -249,13 +263,9 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
     except (ValueError, CorruptCheckpointError) as error:
         kept = begun(root / name)
         return Ending(name, "failed", _aside(root, name, str(error)) if kept else str(error))
-    except (
-        SimulatorError,
-        NonFiniteError,
-        RecordsError,
-        OutOfMemoryError,
-        jax.errors.JaxRuntimeError,
-    ) as error:
+    except OutOfMemoryError as error:  # which says how it goes on
+        return Ending(name, "failed", f"{error} (it is kept as it is)")
+    except (SimulatorError, NonFiniteError, RecordsError, jax.errors.JaxRuntimeError) as error:
         return failed_but_kept(name, str(error))
     if kind == "finished":
         forget(root, name)

@@ -8,6 +8,8 @@ from pathlib import Path
 import envs
 from dreamer_jax.devices import Choice
 from experiments.runs.folder import folders
+from experiments.runs.spec import Mapped
+from experiments.runs.ways_out import WORK
 from experiments.thesis.engines import Engine, Resources, Task
 from experiments.thesis.engines.local import in_turn, one_by_one
 from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due, inspect_run
@@ -66,6 +68,8 @@ def carry_out_runs(
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
     devices: Choice = "all",
+    mapping: Mapped = "auto",
+    mapping_chunk: int = 1,
     resources: Callable[[PlannedRun], Resources] = lambda run: Resources(),
     say: Say = print,
 ) -> Progress:
@@ -79,6 +83,7 @@ def carry_out_runs(
       accept_failed: take sources whose losses were not finite any more, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
       devices: how many, of those that a run is given, to spread its members over.
+      mapping, mapping_chunk: how they are mapped there, see `jobs.Job`.
       resources: what a run gets.
       say: where messages go.
     """
@@ -91,7 +96,7 @@ def carry_out_runs(
     names = {run.name for run in left}
     tasks = [
         Task(
-            Job(root, run.name, workers, accept_failed, timeout, devices),
+            Job(root, run.name, workers, accept_failed, timeout, devices, mapping, mapping_chunk),
             run,
             tuple(name for name in run.needs if name in names),
             resources(run),
@@ -111,6 +116,8 @@ def work(
     accept_failed: bool = False,
     timeout: float = envs.SIMULATOR_TIMEOUT,
     devices: Choice = "all",
+    mapping: Mapped = "auto",
+    mapping_chunk: int = 1,
     train: Train | None = None,
     say: Say = print,
     poll: float = POLL_SECONDS,
@@ -124,6 +131,7 @@ def work(
       accept_failed: take sources whose losses were not finite any more, as they were before.
       timeout: seconds after which a simulator that does not answer is given up.
       devices: how many, of those that a run is given, to spread its members over.
+      mapping, mapping_chunk: how they are mapped there, see `jobs.Job`.
       train: what trains one run.
       say: where messages go.
       poll: seconds between looks at what others do.
@@ -135,8 +143,9 @@ def work(
         # Of copies that hold the same agents, that which plans take.
         names = {folder for folder, _ in folders(root).values()}
         runs = {folder.name: inspect_run(folder) for folder in sorted(names)}
+        settings = (workers, accept_failed, timeout, devices, mapping, mapping_chunk, WORK)
         return [
-            Task(Job(root, run.name, workers, accept_failed, timeout, devices), run, run.needs)
+            Task(Job(root, run.name, *settings), run, run.needs)
             for run in due(list({**planned, **runs}.values()))
         ]
 
