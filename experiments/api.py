@@ -225,19 +225,28 @@ def transfer(
 
 
 def evaluate(
-    trained: Trained | str | Path, episodes: int = 5, *, workers: int | None = None
+    trained: Trained | str | Path,
+    episodes: int = 5,
+    *,
+    workers: int | None = None,
+    devices: Choice = "all",
 ) -> list[dict[str, Any]]:
     """Plays whole episodes with every agent of a run: the mode, without noise.
+
+    Args:
+      trained: a run, or its folder.
+      episodes: of each agent on each task.
+      workers, devices: as for `train`.
 
     Returns:
       One row per agent, task and episode: member, seed, label, task, episode, return, length,
       fell.
 
     Raises:
-      ValueError: the folder holds no run or no checkpoint.
+      ValueError: the folder holds no run or no checkpoint, or there are not so many devices.
     """
     agents = evaluation.load_agents(_folder(trained))
-    return evaluation.evaluate(agents, episodes, workers=workers)
+    return evaluation.evaluate(agents, episodes, workers=workers, devices=devices)
 
 
 def load(trained: Trained | str | Path, member: int = 0) -> Player:

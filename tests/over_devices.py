@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
 from dreamer_jax import population
@@ -28,8 +29,10 @@ from dreamer_jax.randomness import update_key
 from dreamer_jax.training import Member, Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
+from experiments.runs import evaluate as evaluation
+from experiments.runs.evaluate import load_agents
 from probes import Probe
-from runs import batch_for
+from runs import batch_for, spec_of, write_run
 
 DEBUG = preset("debug")
 TASKS = ("probe/left", "probe/right")
@@ -232,6 +235,27 @@ def the_real_update_is_the_same_on_a_device_of_its_own(folder):
         np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-3, atol=1e-5)
 
 
+def agents_are_evaluated_on_their_devices_as_on_one(folder):
+    """5 members on 1 and on 3 devices, 2 on each: the same episodes, and padding in none."""
+    spec = spec_of("inverted_pendulum", seeds=(0, 1, 2, 3, 4))
+    write_run(folder / "evaluated", spec)
+    agents, shards = load_agents(folder / "evaluated"), []
+    make_env = evaluation.make_env
+
+    def watched(*arguments, **options):
+        shards.append(make_env(*arguments, **options))
+        return shards[-1]
+
+    evaluation.make_env = watched
+    one, three = (evaluation.evaluate(agents, 1, devices=devices) for devices in (1, 3))
+    evaluation.make_env = make_env
+    assert [env.shards for env in shards] == [1, 3]
+    assert len(one) == len(three) == 5
+    for row, other in zip(one, three, strict=True):
+        assert other.pop("return") == pytest.approx(row.pop("return"), rel=1e-3)
+        assert other == row
+
+
 def members_that_are_few_leave_devices_alone(folder):
     told = {(3, "all"): (3, 1), (9, "all"): (5, 2), (8, 3): (3, 3), (16, "all"): (8, 2)}
     for (members, choice), (count, each) in told.items():
@@ -248,6 +272,7 @@ LAWS = (
     killed_on_many_devices_a_run_goes_on_with_fewer,
     a_replay_on_the_devices_is_filled_from_files_of_another_number,
     the_real_update_is_the_same_on_a_device_of_its_own,
+    agents_are_evaluated_on_their_devices_as_on_one,
 )
 
 if __name__ == "__main__":
