@@ -21,7 +21,7 @@ from dreamer_jax import population
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from dreamer_jax.config import preset
-from dreamer_jax.devices import place
+from dreamer_jax.devices import Placement, place
 from dreamer_jax.learning import AgentState
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Population
@@ -31,6 +31,7 @@ from envs.base import TaskSpec
 from envs.bridge import HostEnv
 from experiments.runs import evaluate as evaluation
 from experiments.runs.evaluate import load_agents
+from experiments.runs.start import load_sources, transferred_members
 from probes import Probe
 from runs import batch_for, spec_of, write_run
 
@@ -256,6 +257,46 @@ def agents_are_evaluated_on_their_devices_as_on_one(folder):
         assert other == row
 
 
+def targets_begin_on_their_own_devices_as_on_one(folder):
+    """Each device makes its own members: of two sources with agents from scratch beside them, and
+    of stored models that each target has of its own."""
+    for seed, name in enumerate(("one", "two")):
+        write_run(folder / name, spec_of("hopper"), seed)
+    sources = (folder / "one", folder / "two")
+    write_run(folder / "uae", spec_of("hopper", "ant"))
+    for task in ("hopper", "ant"):
+        write_run(folder / task, spec_of(task, sources=(folder / "uae",), method="uae"))
+    stored = (folder / "hopper", folder / "ant")
+    meta = {"sources": (folder / "uae",), "reward_sources": stored, "method": "meta"}
+    for spec in (
+        spec_of("ant", sources=sources, omegas=(0.0, 0.2), baseline=True),
+        spec_of("walker2d", seeds=(0, 1, 2), **meta),
+    ):
+        read, placement = load_sources(spec), place(len(spec.members), 2)
+        assert placement.padded == len(spec.members) + 1
+        (state, report), (other, told) = (
+            transferred_members(spec, read, placement=where)
+            for where in (place(len(spec.members), 1), placement)
+        )
+        assert told.members == report.members == len(spec.method.targets(spec.seeds))
+        assert told.rows == report.rows
+        for one, two in zip(*map(jax.tree.leaves, ((state, report), (other, told))), strict=True):
+            np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-5, atol=1e-6)
+        assert_made_apart(spec, read, placement)
+
+
+def assert_made_apart(spec, sources, placement):
+    """What devices made was divided among them before it came to the host."""
+    seen, own = [], Placement.own
+    Placement.own = lambda self, tree: seen.append(tree) or own(self, tree)
+    try:
+        transferred_members(spec, sources, placement=placement)
+    finally:
+        Placement.own = own
+    ((state, report),) = seen
+    assert_spread((state, report), placement)
+
+
 def members_that_are_few_leave_devices_alone(folder):
     told = {(3, "all"): (3, 1), (9, "all"): (5, 2), (8, 3): (3, 3), (16, "all"): (8, 2)}
     for (members, choice), (count, each) in told.items():
@@ -273,6 +314,7 @@ LAWS = (
     a_replay_on_the_devices_is_filled_from_files_of_another_number,
     the_real_update_is_the_same_on_a_device_of_its_own,
     agents_are_evaluated_on_their_devices_as_on_one,
+    targets_begin_on_their_own_devices_as_on_one,
 )
 
 if __name__ == "__main__":

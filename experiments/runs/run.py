@@ -106,7 +106,9 @@ def make_run(
         state, report = None, None
         if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
             sources = load_sources(spec, base, accept_failed=accept_failed)
-            state, report = transferred_members(spec, sources, workers=workers, timeout=timeout)
+            state, report = transferred_members(
+                spec, sources, workers=workers, timeout=timeout, placement=placement
+            )
         agent = make_agent(spec)
         env = make_env(spec, workers=workers, timeout=timeout, shards=placement.count)
         # What cannot be had is refused before the folder is made.
