@@ -12,9 +12,10 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 # What tests compile runs for milliseconds: quick compilation matters more than quick code.
 _flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
-# Later versions do not know this flag, and end the process that sets it.
+# Later versions do not know the first of these flags, and end the process that sets it.
 if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
-    _flags.append("--xla_cpu_use_fusion_emitters=false")
+    # In one part, since there is a core for each process of tests, and less to do in all.
+    _flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join(_flags).strip()
 
 LONGEST = (

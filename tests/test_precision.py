@@ -11,6 +11,7 @@ from dreamer_jax import networks
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.diagnosis import diagnose
+from dreamer_jax.population import init_members
 from dreamer_jax.rollout import collect
 from probes import Probe
 
@@ -160,6 +161,7 @@ def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
 
 def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_seeds():
     batches = stored_batches(agent_of("float32"))
+    starts = init_members(agent_of("float32"), jnp.arange(SEEDS))
 
     def losses(precision, seeds):
         """Those of all updates, each [seeds, UPDATES]."""
@@ -169,12 +171,12 @@ def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_s
             state, metrics = agent.update(state, jax.tree.map(lambda x: x[number], batches))
             return state, {name: metrics[name] for name in LOSSES}
 
-        def train(seed):
-            return jax.lax.scan(update, agent.init(seed), jnp.arange(UPDATES) % STORED)
+        def train(state):
+            return jax.lax.scan(update, state, jnp.arange(UPDATES) % STORED)
 
         # One after another: that compiles faster than all at once.
-        every = jax.jit(lambda seeds: jax.lax.map(train, seeds))
-        states, history = every(jnp.arange(seeds))
+        every = jax.jit(lambda states: jax.lax.map(train, states))
+        states, history = every(jax.tree.map(lambda x: x[:seeds], starts))
         assert states.healthy.all()
         return {name: np.asarray(x) for name, x in history.items()}
 
