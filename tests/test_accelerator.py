@@ -7,6 +7,7 @@ import dataclasses
 import json
 import signal
 import subprocess
+import time
 
 import jax
 import pytest
@@ -15,6 +16,7 @@ from benchmarks.__main__ import main
 from benchmarks.accelerator import command, measures
 from benchmarks.accelerator.peaks import known_peaks
 from benchmarks.accelerator.plan import LEARNING_TASK, SIZES, Part, parts
+from benchmarks.accelerator.table import at_once
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from experiments.thesis.measurement import operations
@@ -264,6 +266,8 @@ def test_where_memory_is_short_members_are_updated_in_chunks_and_the_row_says_so
     assert found["mapped"] == "chunks of 4" and found["without_memory"] == ["vmap", "chunks of 8"]
     assert found["member_updates_per_second"] == 9 / 0.5
     assert told == [{"told": "vmap: no memory for it"}, {"told": "chunks of 8: no memory for it"}]
+    said = at_once(found["mapped"], found["without_memory"])
+    assert said == "chunks of 4 (no memory for vmap, chunks of 8)"
 
 
 def test_what_is_known_to_be_far_too_large_is_not_even_compiled(monkeypatch):
@@ -286,7 +290,8 @@ def test_a_run_that_learns_ends_by_the_clock_saved_and_goes_on(tmp_path, monkeyp
     schedule = dataclasses.replace(endless.schedule, environment_steps=10**6)
     endless = dataclasses.replace(endless, schedule=schedule)
     monkeypatch.setattr(measures, "preset", lambda name: endless)
-    part = measures.LearningPart(SIZES["debug"], {"folder": tmp_path / "run", "seconds": 1})
+    request = {"folder": tmp_path / "run", "seconds": 1, "until": time.time() + 100}
+    part = measures.LearningPart(SIZES["debug"], request)
     first = part(LEARNING_TASK, lambda event: None)
     assert first["ended"] == "by the clock" and first["seconds"] > 0
     second = part(LEARNING_TASK, lambda event: None)

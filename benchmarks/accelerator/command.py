@@ -178,10 +178,12 @@ class Command:
             "sizes": self._options.sizes,
             "cases": list(cases),
             "peer": self._peer(),
-            "seconds": seconds,
+            # The run that learns does not have what other parts leave.
+            "seconds": part.share * 60 * self._options.minutes,
+            "until": time.time() + seconds,
             "folder": str(out.with_name(f"{out.stem}-learning").absolute()),
         }
-        # The run that learns ends by itself when its time is up.
+        # The run that learns ends by itself before its time is up.
         limit, grace = seconds, GRACE_SECONDS
         if part.name == "learning":
             limit, grace = seconds + SAVING_SECONDS, SAVING_SECONDS

@@ -49,6 +49,9 @@ REFERENCE = Path(__file__).parents[2] / "tests" / "golden" / "pytorch_reference.
 MOST = 50
 """What is timed is repeated no more often than this."""
 
+SAVING_SECONDS = 10.0
+"""How long before the end of its time a run that learns is asked to save."""
+
 Say = Callable[[dict[str, Any]], None]
 
 
@@ -309,11 +312,11 @@ class LearningPart:
 
     def __init__(self, sizes: Sizes, request: dict[str, Any]):
         self._sizes, self._folder = sizes, Path(request["folder"])
-        self._seconds = request["seconds"]
+        self._seconds, self._until = request["seconds"], request["until"]
 
     def __call__(self, case: str, say: Say) -> dict[str, Any]:
-        spec = in_memory(RunSpec((LEARNING_TASK,), self._sizes.seeds, preset(self._sizes.learning)))
-        run = make_run(spec, self._folder, resume=True)
+        spec = RunSpec((LEARNING_TASK,), self._sizes.seeds, preset(self._sizes.learning))
+        run = make_run(in_memory(spec, 1), self._folder, resume=True, devices=1)
         write = run.writer.write
 
         def telling(row):
@@ -330,7 +333,8 @@ class LearningPart:
             out_of_time.set()
             os.kill(os.getpid(), signal.SIGINT)
 
-        timer = threading.Timer(max(1.0, self._seconds - spent(self._folder)), stop)
+        left = min(self._seconds - spent(self._folder), self._until - SAVING_SECONDS - time.time())
+        timer = threading.Timer(max(1.0, left), stop)
         timer.daemon = True
         timer.start()
         outcome = carry_out(run)

@@ -26,6 +26,11 @@ def percent(share: float | None) -> str:
     return NO_FIGURE if share is None else f"{100 * share:.2g} %"
 
 
+def at_once(mapped: str, without_memory: Sequence[str]) -> str:
+    """How members were mapped, and how they were not for want of memory."""
+    return f"{mapped} (no memory for {', '.join(without_memory)})" if without_memory else mapped
+
+
 def table(values: dict[str, Any]) -> str:
     """All tables, and above them what they are of.
 
@@ -113,7 +118,7 @@ _TABLES: tuple[tuple[str, Callable[[str], bool], tuple[Column, ...]], ...] = (
         lambda part: part.startswith("update"),
         (
             ("member updates a second", lambda x: number(x["member_updates_per_second"])),
-            ("members at once", lambda x: x["mapped"]),
+            ("members at once", lambda x: at_once(x["mapped"], x["without_memory"])),
             ("share of the peak", lambda x: percent(x["share_of_peak"])),
             ("compiled in, s", lambda x: number(x["compile_seconds"])),
             ("most memory", lambda x: size(x["peak_bytes"])),
