@@ -210,8 +210,8 @@ def test_a_run_that_was_begun_on_a_larger_device_goes_on_on_a_smaller_one(
     run = PlannedRun("run", ("a cell",) * 8, spec)
     monkeypatch.setattr(memory, "at_once", lambda agent, members: of_settings(agent))
     monkeypatch.setattr(memory, "room_for", lambda *_: 2)
-    assert jobs.train(run, tmp_path, None) == "stopped"
-    assert jobs.train(run, tmp_path, None, mapping="chunks", mapping_chunk=1) == "stopped"
+    assert jobs.train(run, tmp_path) == "stopped"
+    assert jobs.train(run, tmp_path, jobs.Means(mapping="chunks", mapping_chunk=1)) == "stopped"
     assert begun == [("chunks", 2), ("chunks", 1)]
 
 

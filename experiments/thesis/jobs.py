@@ -7,7 +7,6 @@ What fails is named. A folder that is damaged is set aside: renamed, never delet
 """
 
 import contextlib
-import functools
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -38,8 +37,36 @@ from experiments.thesis.speeds import cache_folder
 POLL_SECONDS = 5.0
 """How often whoever waits for others looks whether they are done."""
 
-Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
 Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Means:
+    """How whoever claims a run trains it; it changes no result but by rounding.
+
+    Attributes:
+      workers: simulator processes; by default one per core.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many, of those there, to spread members over.
+      mapping, mapping_chunk: how they are mapped there; "auto" asks the device's memory, whatever
+        was right where the run was begun.
+      ways: what to do about a device without memory, in the words of what was called.
+    """
+
+    workers: int | None = None
+    accept_failed: bool = False
+    timeout: float = envs.SIMULATOR_TIMEOUT
+    devices: Choice = "all"
+    mapping: Mapped = "auto"
+    mapping_chunk: int = 1
+    ways: WaysOut = GRID
+
+
+PLAIN = Means()
+"""As whoever does not say how has it."""
+
+Train = Callable[[PlannedRun, Path, Means], Literal["finished", "stopped"]]
 
 
 @dataclass(frozen=True)
@@ -49,24 +76,12 @@ class Job:
     Attributes:
       root: the folder of all results.
       name: of the run.
-      workers: simulator processes; by default one per core.
-      accept_failed: take sources whose losses were not finite any more, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many to spread its members over.
-      mapping, mapping_chunk: how they are mapped there; "auto" asks the device's memory, whatever
-        was right where the run was begun.
-      ways: what to do about a device without memory, in the words of what was called.
+      means: how.
     """
 
     root: Path
     name: str
-    workers: int | None = None
-    accept_failed: bool = False
-    timeout: float = envs.SIMULATOR_TIMEOUT
-    devices: Choice = "all"
-    mapping: Mapped = "auto"
-    mapping_chunk: int = 1
-    ways: WaysOut = GRID
+    means: Means = PLAIN
 
 
 @dataclass(frozen=True)
@@ -93,27 +108,13 @@ def failed_but_kept(name: str, why: str) -> Ending:
     return Ending(name, "failed", f"{why} (it is kept as it is; the same command goes on)")
 
 
-def train(
-    run: PlannedRun,
-    root: Path,
-    workers: int | None,
-    *,
-    accept_failed: bool = False,
-    timeout: float = envs.SIMULATOR_TIMEOUT,
-    devices: Choice = "all",
-    mapping: Mapped = "auto",
-    mapping_chunk: int = 1,
-    ways: WaysOut = GRID,
-) -> Literal["finished", "stopped"]:
+def train(run: PlannedRun, root: Path, means: Means = PLAIN) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
     Args:
       run: which one.
       root: the folder of all results.
-      workers: simulator processes; by default one per core.
-      accept_failed: transfer from agents that failed, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices, mapping, mapping_chunk, ways: see `Job`.
+      means: how.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
@@ -128,18 +129,18 @@ def train(
         write_json_atomically(folder / CELLS, list(run.cells))
     try:
         begins = make_run(
-            in_memory(mapped(run.spec, mapping, mapping_chunk), devices),
+            in_memory(mapped(run.spec, means.mapping, means.mapping_chunk), means.devices),
             folder,
             resume=True,
-            workers=workers,
+            workers=means.workers,
             base=root,
-            accept_failed=accept_failed,
-            timeout=timeout,
-            devices=devices,
+            accept_failed=means.accept_failed,
+            timeout=means.timeout,
+            devices=means.devices,
             lock=lock,
             cells=run.cells,
         )
-        return carry_out(begins, ways)
+        return carry_out(begins, means.ways)
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
@@ -243,21 +244,13 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
         return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
     if train is None:
         try:
-            check_devices(job.devices)
+            check_devices(job.means.devices)
         except ValueError as error:
             return Ending(name, "failed", str(error))
-        train = functools.partial(
-            _train,
-            accept_failed=job.accept_failed,
-            timeout=job.timeout,
-            devices=job.devices,
-            mapping=job.mapping,
-            mapping_chunk=job.mapping_chunk,
-            ways=job.ways,
-        )
+        train = _train
     begins(run)
     try:
-        kind = train(run, root, job.workers)
+        kind = train(run, root, job.means)
     except FolderInUseError:
         raise
     except (ValueError, CorruptCheckpointError) as error:
