@@ -34,6 +34,7 @@ COMMANDS = {
     "rollout-brax-64": f"rollout task={BRAX} P=1,8 image_size=64",
     "brax": "brax",
     "replay": "replay",
+    "collecting": "collecting",
     "transfer": "transfer",
     "streaming": "streaming",
     "train": "train",

@@ -1,13 +1,15 @@
 """Memory and speed of the replay at full size: a million environment steps of each member.
 
     python -m benchmarks.replay [records=500000] [P=3] [image_size=64] [actions=8] [B=50] [L=50]
-                                [batches=50] [directory=/tmp]
+                                [batches=50] [threads=0] [keep=0] [directory=/tmp]
 
 Writes random records into a new folder in `directory` (18 GB by default), samples batches from
 them, and removes the folder. Prints one line of JSON: "anonymous_gib" is by how much the memory of
 the process grew that no file stands behind, at its largest; "seconds_per_batch" are of one batch
-for all members, "cold" right after the page cache was told to drop the files, "warm" after as
-many batches of other places in them.
+for all members, put together by so many `threads` (0: as a run does by itself), "cold" right after
+the page cache was told to drop the files, "warm" after as many batches of other places in them.
+With keep=1 freed memory is kept, as a run does: batches then take no new pages, and the last one's
+memory counts as grown.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 
@@ -32,6 +35,8 @@ DEFAULTS = {
     "B": 50,
     "L": 50,
     "batches": 50,
+    "threads": 0,
+    "keep": 0,
     "directory": tempfile.gettempdir(),
 }
 PHASE = 1000
@@ -92,8 +97,17 @@ def main(arguments: list[str]) -> None:
         sys.exit(f"got {sorted(unknown)}, expected names among {list(DEFAULTS)}")
     settings = DEFAULTS | {name: type(DEFAULTS[name])(value) for name, value in given.items()}
     batch, length, batches = settings["B"], settings["L"], settings["batches"]
+    if settings["keep"]:
+        keep_freed_memory()
     with tempfile.TemporaryDirectory(dir=settings["directory"]) as directory:
-        replay = Replay(directory, settings["P"], 1, settings["image_size"], settings["actions"])
+        replay = Replay(
+            directory,
+            settings["P"],
+            1,
+            settings["image_size"],
+            settings["actions"],
+            threads=settings["threads"] or None,
+        )
         before, start = anonymous_bytes(), time.perf_counter()
         most_filling = fill(replay, settings["records"])
         filled = time.perf_counter() - start

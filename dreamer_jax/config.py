@@ -178,6 +178,11 @@ class ScheduleConfig:
     """Phases of random actions before the first update (several tasks: 1 phase of each)."""
     updates_per_phase: int = setting(100, 0, 10**6)
     """Updates for each phase collected."""
+    collect: Literal["before", "beside"] = "before"
+    """When a phase is collected. before: between updates, with the newest policy, as the thesis
+    does. beside: on a thread, beside the updates of the round before it and with the policy from
+    before them, so that simulators on the host and the device do not wait for one another; a round
+    is then the least that can be stopped."""
     evaluate_every: int = setting(10_000, 1, 10**12)
     """Environment steps between evaluations."""
     checkpoint_every: int = setting(10_000, 1, 10**12)
@@ -187,8 +192,12 @@ class ScheduleConfig:
     given: all of them."""
     replay: Literal["auto", "files", "device"] = "auto"
     """Where updates take records from. Files; or a copy of them in the device's memory, with which
-    a round is one program, if the environment has no host. auto: the device on an accelerator,
-    where that takes at most half of its memory; else files."""
+    the updates of a round are one program (without simulators on the host, its phase is a part of
+    it). auto: the device on an accelerator, where that takes at most half of its memory; else
+    files."""
+    replay_threads: int | None = setting(None, 1, 256)
+    """Threads that put a batch together from files; none given: 4, or as many as there are cores if
+    these are fewer."""
     mapping: Literal["auto", "vmap", "chunks"] = "auto"
     """How members of a population are mapped in an update; auto: chunks on CPU, vmap elsewhere."""
     mapping_chunk: int = setting(1, 1, 10**6)

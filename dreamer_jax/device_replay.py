@@ -119,17 +119,30 @@ def filled(
     store = placement.over_devices(jax.jit(write, donate_argnums=0), axes=(0, 0, None), donate=(0,))
     oldest = max(0, held_records - (capacity if files.keep is None else files.keep))
     for phase in range(oldest // records, phases):
-        # What is deleted is never sampled.
-        start = max(phase * records, int(files.deleted.max()))
-        missing = start - phase * records
-        streams = [
-            _padded(files.read(p, k, start, (phase + 1) * records), missing)
-            for p, k in np.ndindex(files.members, files.tasks)
-        ]
-        rows = jax.tree.map(lambda *x: np.stack(x), *streams)
-        rows = rows.map(lambda x: x.reshape(files.members, files.tasks, *x.shape[1:]))
+        rows = phase_of(files, phase, records)
         held = store(held, placement.spread(rows), jnp.int32(phase))
     return held
+
+
+def phase_of(files: Replay, phase: int, records: int) -> Records:
+    """One phase as the files hold it, with zeros for what is deleted (which is never sampled).
+
+    Args:
+      files: the streams.
+      phase: its number.
+      records: T + 1.
+
+    Returns:
+      NumPy leaves [P, K, T + 1, ...].
+    """
+    start = max(phase * records, int(files.deleted.max()))
+    missing = start - phase * records
+    streams = [
+        _padded(files.read(p, k, start, (phase + 1) * records), missing)
+        for p, k in np.ndindex(files.members, files.tasks)
+    ]
+    rows = jax.tree.map(lambda *x: np.stack(x), *streams)
+    return rows.map(lambda x: x.reshape(files.members, files.tasks, *x.shape[1:]))
 
 
 def _padded(records: Records, missing: int) -> Records:

@@ -5,7 +5,9 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,21 @@ from dreamer_jax.freezing import Params
 from dreamer_jax.learning import AgentState
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect
+
+
+@dataclass(frozen=True)
+class Member:
+    """One member of a population.
+
+    Attributes:
+      seed: of its parameters, simulators, batches and noise.
+      label: how it is named in messages and metrics.
+      tags: further columns of its metrics (for example omega).
+    """
+
+    seed: int
+    label: str
+    tags: Mapping[str, Any] = field(default_factory=dict)
 
 
 def map_members(function, mapping: str, chunk: int = 1):
@@ -78,6 +95,12 @@ def update_members(
     return state, sums, metrics["model_loss"]
 
 
+@jax.jit
+def copied(tree):
+    """A tree of arrays in memory of their own, which no program that reuses the other's writes."""
+    return jax.tree.map(jnp.copy, tree)
+
+
 @functools.partial(jax.jit, static_argnames="agent")
 def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
     """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
@@ -105,6 +128,35 @@ def zero_sums(agent: Agent, state: AgentState, batch_size: int, length: int) -> 
     return {name: jnp.zeros(members, x.dtype) for name, x in metrics.items()}
 
 
+def check_environment(agent: Agent, env, placement: Placement) -> None:
+    """Whether an environment is one for these agents, and for where they lie.
+
+    Raises:
+      ValueError: it is not; names both sides.
+    """
+    if (shards := getattr(env, "shards", 1)) != placement.count:
+        raise ValueError(
+            f"the environment is made for {shards} devices, the members lie on "
+            f"{placement.count}: build it with shards={placement.count}"
+        )
+    if env.action_size != agent.action_size:
+        raise ValueError(
+            f"the environment takes actions of size {env.action_size}, the agent gives "
+            f"{agent.action_size}: build both for the same tasks"
+        )
+    if env.discrete != agent.discrete:
+        kinds = ["discrete" if x.discrete else "continuous" for x in (env, agent)]
+        raise ValueError(
+            f"the environment takes {kinds[0]} actions, the agent gives {kinds[1]} ones: "
+            "build both for the same tasks"
+        )
+    if env.image_size != agent.config.network.image_size:
+        raise ValueError(
+            f"the environment renders {env.image_size} pixels, the agent reads "
+            f"{agent.config.network.image_size}: build both with the same image_size"
+        )
+
+
 class Population:
     """What an agent does, for all members: each device does it for its own.
 
@@ -120,6 +172,7 @@ class Population:
     Attributes:
       own_seeds: of the members.
       seeds: int32 [P], the same on the devices.
+      copied: a function of a tree, leaves [P, ...]: it in memory of its own.
     """
 
     def __init__(
@@ -134,6 +187,7 @@ class Population:
         self._update = over(self._update_members, axes=(0, 0, 0), donate=(0, 1))
         self._collect = over(self._collect_members, axes=(0, 0, 0, None, None, 0))
         self._diagnose = over(functools.partial(diagnose, agent), axes=(0, 0, 0, None))
+        self.copied = over(copied, axes=(0,))
 
     def fresh(self) -> AgentState:
         """Fresh agents of the members' seeds: leaves [P, ...]."""

@@ -40,6 +40,7 @@ from dreamer_jax.records import Records
 from dreamer_jax.sampling import sample_indices
 from dreamer_jax.schema import check_shape
 from dreamer_jax.stream_checksums import StreamChecksums
+from dreamer_jax.stream_reader import Place, StreamReader
 
 _HEADER = "replay.json"
 _DELETED = "deleted.json"
@@ -74,6 +75,8 @@ class Replay:
       action_size: A.
       keep: sample only from the newest `keep` records of each stream; None for all. The others
         stay on the disk until `delete` is called.
+      threads: how many put a batch together; by default 4, or as many as there are cores if these
+        are fewer.
 
     Raises:
       ValueError: the folder holds a replay of another layout, or `keep` is less than 1.
@@ -87,6 +90,7 @@ class Replay:
         image_size: int,
         action_size: int,
         keep: int | None = None,
+        threads: int | None = None,
     ):
         layout = {
             "members": int(members),
@@ -112,6 +116,12 @@ class Replay:
         self._unsynced: set[tuple[int, int]] = set()
         self._folder_synced = False
         self._deleted = self._stored_deleted()
+        self._paths = {stream: self.path(*stream) for stream in self._streams()}
+        self._reader = StreamReader(self.dtype, threads)
+
+    def close(self) -> None:
+        """Closes files and ends threads, until they are needed again."""
+        self._reader.close()
 
     def _open(self, layout: Mapping[str, int]) -> None:
         header = self.directory / _HEADER
@@ -254,6 +264,7 @@ class Replay:
 
     def _cut(self) -> None:
         """Drop from the files whatever lies beyond the committed lengths."""
+        self._reader.drop()
         for stream in self._streams():
             size = int(self._lengths[stream]) * self.dtype.itemsize
             path = self.path(*stream)
@@ -395,13 +406,9 @@ class Replay:
                 f"records [{start}, {stop}) of {self.path(member, task)} were asked for, "
                 f"it holds [{oldest}, {held})"
             )
-        records = self._empty((stop - start,))
-        if stop > start:
-            self._checksums[member, task].check_records(start, stop)
-            stream = self._map(member, task)
-            for name, values in records._asdict().items():
-                values[:] = stream[name][start:stop]
-        return records
+        self._checksums[member, task].check_records(start, stop)
+        places = [self._place(member, task, start)] if stop > start else []
+        return self._reader.sequences(places, stop - start)
 
     def sample(
         self,
@@ -441,9 +448,8 @@ class Replay:
             raise ValueError(
                 f"lengths {lengths.tolist()} are not at most the committed {self._lengths.tolist()}"
             )
-        result = self._empty((len(members), batch, length))
-        fields = result._asdict()
-        for position, (member, seed) in enumerate(zip(members, seeds, strict=True)):
+        places = []
+        for member, seed in zip(members, seeds, strict=True):
             try:
                 tasks, starts = sample_indices(
                     int(seed),
@@ -456,14 +462,10 @@ class Replay:
                 )
             except ValueError as error:
                 raise ValueError(f"member {member} of {self.directory}: {error}") from None
-            for task in np.unique(tasks):
-                stream = self._map(member, task)
-                for row in np.flatnonzero(tasks == task):
-                    self._checksums[member, task].check_records(starts[row], starts[row] + length)
-                    sequence = stream[starts[row] : starts[row] + length]
-                    for name, values in fields.items():
-                        values[position, row] = sequence[name]
-        return result
+            for task, start in zip(tasks.tolist(), starts.tolist(), strict=True):
+                self._checksums[member, task].check_records(start, start + length)
+                places.append(self._place(member, task, start))
+        return self._reader.sequences(places, length, len(members), batch)
 
     def batches(
         self, seeds: Sequence[int], updates: Iterable[int], batch: int, length: int, depth: int = 2
@@ -479,19 +481,8 @@ class Replay:
 
         return Prefetcher(prepare, updates, depth)
 
-    def _empty(self, shape: tuple[int, ...]) -> Records:
-        layouts = (self.dtype[name] for name in Records._fields)
-        return Records(*(np.empty(shape + layout.shape, layout.base) for layout in layouts))
-
-    def _map(self, member: int, task: int) -> np.ndarray:
-        """A stream as a read-only array of records, mapped from its file for one reading.
-
-        Made anew each time (tens of microseconds), so that no map outlives a truncation and a
-        large population holds no more files open than it is reading. Only committed records are
-        mapped: a killed process may have left half of one behind them.
-        """
-        shape = (int(self._lengths[member, task]),)
-        return np.memmap(self.path(member, task), self.dtype, "r", shape=shape)
+    def _place(self, member: int, task: int, start: int) -> Place:
+        return Place(self._paths[member, task], int(self._lengths[member, task]), start)
 
 
 def _write(file, rows: np.ndarray) -> None:

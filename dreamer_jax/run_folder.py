@@ -134,6 +134,7 @@ class RunFolder:
         self.replay.delete(np.min(lengths, axis=0))
 
     def close(self) -> None:
-        """Closes the metrics files, and gives the lock back."""
+        """Closes the files, and gives the lock back."""
         self.writer.close()
+        self.replay.close()
         self._lock.release()

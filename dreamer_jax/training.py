@@ -7,11 +7,10 @@ from its last checkpoint gives the same metrics, byte for byte, as one that was 
 Axis letters: P population member, K task, B batch, L sequence length, T ticks in a phase.
 """
 
+import contextlib
 import dataclasses
-import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,52 +19,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from dreamer_jax.agent import Agent, Mode
+from dreamer_jax.ahead import PhaseAhead, on_thread
 from dreamer_jax.device_round import DeviceRounds, on_device
 from dreamer_jax.devices import Placement, on_one_device
-from dreamer_jax.diagnosis import warnings
 from dreamer_jax.learning import AgentState
 from dreamer_jax.locks import FolderLock
-from dreamer_jax.population import Population
+from dreamer_jax.population import Member, Population, check_environment
 from dreamer_jax.progress import Progress
 from dreamer_jax.record_checks import check_records
 from dreamer_jax.records import Records
-from dreamer_jax.rollout import episodes
 from dreamer_jax.run_folder import RunFolder
+from dreamer_jax.run_rows import RunRows
 from dreamer_jax.schedule import Counters, Schedule
 from dreamer_jax.stopping import StopRequest
-from dreamer_jax.video import tile, write_video
 from dreamer_jax.waiting import to_host
-
-MAXIMUM_VIDEO_MEMBERS = 9
-
-
-@dataclass(frozen=True)
-class Member:
-    """One member of a population.
-
-    Attributes:
-      seed: of its parameters, simulators, batches and noise.
-      label: how it is named in messages and metrics.
-      tags: further columns of its metrics (for example omega).
-    """
-
-    seed: int
-    label: str
-    tags: Mapping[str, Any] = field(default_factory=dict)
 
 
 class NonFiniteError(FloatingPointError):
     """All members of a population have met losses or gradients that are not finite."""
-
-
-def _mean(values: Sequence[float]) -> float:
-    """The mean, NaN of nothing."""
-    return float(np.mean(values)) if len(values) else math.nan
-
-
-def _known_mean(scores: Sequence[float]) -> float:
-    """The mean of the scores that are numbers."""
-    return _mean([score for score in scores if not math.isnan(score)])
 
 
 class Run:
@@ -117,35 +88,14 @@ class Run:
             raise ValueError(
                 f"{placement.members} members are placed, {len(members)} are named: place as many"
             )
-        if (shards := getattr(env, "shards", 1)) != placement.count:
-            raise ValueError(
-                f"the environment is made for {shards} devices, the members lie on "
-                f"{placement.count}: build it with shards={placement.count}"
-            )
-        if env.action_size != agent.action_size:
-            raise ValueError(
-                f"the environment takes actions of size {env.action_size}, the agent gives "
-                f"{agent.action_size}: build both for the same tasks"
-            )
-        if env.discrete != agent.discrete:
-            kinds = ["discrete" if x.discrete else "continuous" for x in (env, agent)]
-            raise ValueError(
-                f"the environment takes {kinds[0]} actions, the agent gives {kinds[1]} ones: "
-                "build both for the same tasks"
-            )
-        if env.image_size != config.network.image_size:
-            raise ValueError(
-                f"the environment renders {env.image_size} pixels, the agent reads "
-                f"{config.network.image_size}: build both with the same image_size"
-            )
+        check_environment(agent, env, placement)
         self.agent, self.env = agent, env
         self.tasks, self.members = tuple(tasks), tuple(members)
         self.directory = Path(directory)
         self.schedule = Schedule(config.schedule, len(self.tasks))
-        self._one_program, self._replay_note = on_device(
+        self._place = on_device(
             agent, getattr(env, "has_host", True), len(self.tasks), placement.each
         )
-        self.videos = videos
         self.placement = placement
         own_seeds = [member.seed for member in self.members]
         self.population = Population(agent, env, len(self.tasks), own_seeds, placement)
@@ -160,10 +110,12 @@ class Run:
                 "image_size": config.network.image_size,
                 "action_size": agent.action_size,
                 "keep": config.schedule.replay_keep,
+                "threads": config.schedule.replay_threads,
             },
         )
         self.checkpoints, self.replay = self.folder.checkpoints, self.folder.replay
         self.writer = self.folder.writer
+        self._rows = RunRows(self.writer, self.schedule, self.tasks, self.members, videos)
         try:
             self._start(state, from_checkpoint)
         except BaseException:
@@ -173,13 +125,15 @@ class Run:
     def _start(self, state: AgentState | None, from_checkpoint: int | None) -> None:
         """Takes up what the folder holds, or else the state given, or else fresh agents."""
         agent, population = self.agent, self.population
-        # Where rounds are one program each; None where updates read the files.
+        # Where the replay is on the device; None where updates read the files.
         self.device_rounds = (
             DeviceRounds(agent, self.env, self.replay, population.own_seeds, self.placement)
-            if self._one_program
+            if self._place.device
             else None
         )
         self.counters = Counters()
+        # What is collected beside updates and not committed yet.
+        self._ahead: PhaseAhead | None = None
         if state is not None and state.updates.shape != (len(self.members),):
             raise ValueError(
                 f"the state holds {state.updates.shape} members, {len(self.members)} are named"
@@ -187,7 +141,6 @@ class Run:
         self.state = population.fresh() if state is None else population.put(state)
         self.sums = population.zero_sums(self.state)
         self._restore(from_checkpoint)
-        self._warned: set[tuple[int, str]] = set()
 
     def _restore(self, step: int | None = None) -> None:
         """Goes back to a checkpoint, by default the newest, if there is one."""
@@ -204,6 +157,13 @@ class Run:
         """Writes a checkpoint of everything that a resumed run needs."""
         tree = self.placement.own({"agent": self.state, "sums": self.sums})
         self.folder.save(self._step(), tree, dataclasses.asdict(self.counters))
+        self._saved_steps = self.schedule.environment_steps(self.counters.rounds)
+
+    def _save_if_due(self) -> None:
+        every = self.schedule.config.checkpoint_every
+        steps = self.schedule.environment_steps(self.counters.rounds)
+        if steps // every > self._saved_steps // every:
+            self.save()
 
     def _step(self) -> int:
         """A number that grows with every action."""
@@ -219,25 +179,27 @@ class Run:
 
         Raises:
           NonFiniteError: no member is healthy any more; what was collected is saved.
-          Exception: what a simulator met; the run is saved as it was before that phase.
+          Exception: what a simulator met; the run is saved as it was before that phase, and before
+            the updates beside it.
         """
         schedule = self.schedule
         with (
             self._progress_bar() as self._bar,
             StopRequest(self._bar.message, getattr(self.env, "hurry", lambda: None)) as stop,
         ):
-            for note in (self._devices_note(), self._replay_note):
+            for note in (self._devices_note(), self._place.note):
                 if note:
                     self._bar.message(note)
             if self.checkpoints.latest() is None:
                 self.save()
-            saved_steps = schedule.environment_steps(self.counters.rounds)
-            while (action := schedule.next(self.counters)) != "done" and not stop.requested:
-                steps = schedule.environment_steps(self.counters.rounds)
-                every = schedule.config.checkpoint_every
-                if action == "collect" and steps // every > saved_steps // every:
-                    self.save()
-                    saved_steps = steps
+            self._saved_steps = schedule.environment_steps(self.counters.rounds)
+            # A phase that is collected ahead belongs to its round: both are done, or none is.
+            while (action := schedule.next(self.counters)) != "done" and (
+                self._ahead or not stop.requested
+            ):
+                ahead = self._ahead is not None
+                if action == "collect" and not ahead:
+                    self._save_if_due()
                 try:
                     if action == "update":
                         self._update(stop)
@@ -249,11 +211,14 @@ class Run:
                     raise
                 except Exception as error:
                     # Nothing of the failed action has been committed.
+                    self._take_back()
                     self.save()
                     if not stop.requested:
                         raise
-                    self._bar.message(f"this phase is given up: {error}")  # type: ignore[unreachable]
+                    self._bar.message(f"this phase is given up: {error}")
                     return "stopped"
+                if action == "collect" and ahead:
+                    self._save_if_due()
             self.save()
         return "finished" if action == "done" else "stopped"
 
@@ -274,127 +239,156 @@ class Run:
             description=self.directory.name,
         )
 
-    def _advance(self, **counters: int) -> None:
-        self.counters = dataclasses.replace(self.counters, **counters)
-
-    def _columns(self, member: int, rounds: int) -> dict[str, Any]:
-        chosen = self.members[member]
-        return {
-            "member": member,
-            "seed": chosen.seed,
-            "label": chosen.label,
-            **chosen.tags,
-            "env_steps": self.schedule.environment_steps(rounds),
-            "updates": self.counters.updates,
-            "healthy": bool(self._healthy[member]),
-        }
-
     def _phase(self, mode: Mode, phase: int) -> Records:
-        started = time.perf_counter()
+        self._let_rest()
+        return self._played(self.state, mode, phase)
+
+    def _let_rest(self) -> None:
         if hasattr(self.env, "rest"):
             # A frozen member learns nothing from what it would play.
             self.env.rest(np.repeat(~self._healthy, len(self.tasks)))
-        records = to_host(self.population.collect(self.state, phase, mode))
+
+    def _played(self, state: AgentState, mode: Mode, phase: int) -> Records:
+        started = time.perf_counter()
+        records = to_host(self.population.collect(state, phase, mode))
         records = self.placement.own(records)
         self.env.check()
         check_records(records, self.tasks, self._healthy)
-        self._time("evaluate" if mode == "evaluate" else "collect", started)
+        what = "evaluate" if mode == "evaluate" else "collect"
+        self._rows.timed(what, time.perf_counter() - started, self.counters)
         return records
 
     def _round(self, mode: Literal["random", "explore"]) -> None:
-        """Collects, and in one program with that makes the updates that are then due, if rounds
-        are one program each."""
+        """Collects, or takes what was collected ahead; and in one program with that makes the
+        updates that are then due, if rounds are one program each."""
+        if self._ahead is not None:
+            self._commit(self._ahead.records.result(), mode)
+            self._ahead = None
+            return
         self._bar.update(phase="collecting at random" if mode == "random" else "collecting")
-        if self.device_rounds is None:
+        if not self._place.one_program:
             self._commit(self._phase(mode, self.counters.rounds), mode)
             return
         started, rounds = time.perf_counter(), self.counters.rounds
         updates = range(self.counters.updates, self.schedule.updates_due(rounds + 1))
-        try:
-            self.state, self.sums, records = self.device_rounds.run(
+        with self._used_up() as device_rounds:
+            self.state, self.sums, records = device_rounds.run(
                 self.state, self.sums, rounds, updates, mode
             )
             self.env.check()
             check_records(records, self.tasks, self._healthy)
-            self._time("round", started, updates=len(updates))
+            seconds = time.perf_counter() - started
+            self._rows.timed("round", seconds, self.counters, updates=len(updates))
             self._commit(records, mode)
-        except Exception:
-            # The agents from before the round are used up.
-            self.device_rounds.forget()
-            self._restore()
-            raise
         if updates:
-            averaged = self.counters.averaged + len(updates)
-            self._advance(updates=updates.stop, averaged=averaged)
-            self._bar.update(updates=updates.stop)
+            self._updated(updates)
             self._write_averages()
 
-    def _commit(self, records: Records, mode: Literal["random", "explore"]) -> None:
+    @contextlib.contextmanager
+    def _used_up(self) -> Iterator[DeviceRounds]:
+        """For programs that use up the agents: should one fail, those that are kept, or else those
+        of the newest checkpoint, are taken up."""
+        assert self.device_rounds is not None
+        try:
+            yield self.device_rounds
+        except Exception:
+            self.device_rounds.forget()
+            if self._ahead is None:
+                self._restore()
+            else:
+                self._take_back()
+            raise
+
+    def _collect_ahead(self) -> PhaseAhead:
+        """Begins to collect the next phase, with the policy as it is."""
+        state, sums = self.population.copied((self.state, self.sums))
+        self._let_rest()
+        records = on_thread(self._played, state, "explore", self.counters.rounds)
+        offset = self.writer.offset()
+        return PhaseAhead(records, state, sums, self.counters, self._healthy, offset)
+
+    def _take_back(self) -> None:
+        """Makes the run what it was before a phase that is collected ahead, if there is one."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            ahead.wait()
+            self.state, self.sums, self.counters = ahead.state, ahead.sums, ahead.counters
+            self._healthy = ahead.healthy
+            self.writer.truncate(ahead.metrics)
+
+    def _commit(self, records: Records, policy: Literal["random", "explore"]) -> None:
         """Writes a phase to the replay, and what it brought to the metrics."""
-        rounds = self.counters.rounds
+        rounds = self.counters.rounds + 1
         self.replay.append(records)
-        scores = []
-        for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            found = episodes(records.at(member, task)) if self._healthy[member] else []
-            scores.append(_mean([episode.score for episode in found]))
-            row = {
-                "kind": "collect",
-                **self._columns(member, rounds + 1),
-                "task": self.tasks[task],
-                "policy": mode,
-                "episodes": len(found),
-                "return": scores[-1],
-                "length": _mean([episode.length for episode in found]),
-            }
-            self.writer.write(row)
-        self._advance(rounds=rounds + 1)
-        self._bar.update(
-            env_steps=self.schedule.environment_steps(rounds + 1), last_return=_known_mean(scores)
-        )
+        counters = dataclasses.replace(self.counters, rounds=rounds)
+        score = self._rows.collected(records, policy, counters, self._healthy)
+        self.counters = counters
+        self._bar.update(env_steps=self.schedule.environment_steps(rounds), last_return=score)
 
     def _update(self, stop: StopRequest) -> None:
-        """Makes the updates that are due, or those until a stop is requested."""
-        self._bar.update(phase="updating")
-        learning = self.agent.config.learning
-        due = self.schedule.updates_due(self.counters.rounds)
+        """Makes the updates that are due, perhaps with the next phase collected beside them; from
+        files and without a phase, those until a stop is requested."""
+        rounds, schedule = self.counters.rounds, self.schedule
+        # The first phase after the random ones is for a policy that has been trained.
+        if (
+            schedule.config.collect == "beside"
+            and schedule.prefill_rounds < rounds < schedule.rounds
+        ):
+            self._bar.update(phase="updating and collecting")
+            self._ahead = self._collect_ahead()
+        else:
+            self._bar.update(phase="updating")
         started, before = time.perf_counter(), self.counters.updates
+        due = range(before, self.schedule.updates_due(self.counters.rounds))
+        if self._place.device:
+            with self._used_up() as device_rounds:
+                self.state, self.sums = device_rounds.update(self.state, self.sums, due)
+            self._updated(due)
+        else:
+            self._update_from_files(due, stop)
+        made, seconds = self.counters.updates - before, time.perf_counter() - started
+        if self._ahead is not None:
+            self._ahead.records.result()
+        self._rows.timed("update", seconds, self.counters, updates=made)
+        if made == len(due):
+            self._write_averages()
+
+    def _update_from_files(self, due: range, stop: StopRequest) -> None:
+        """Makes updates, one batch after the other, until a stop is requested; or, with a phase
+        beside them, until that has failed."""
+        learning = self.agent.config.learning
         loss: jax.Array | None = None
         with self.replay.batches(
-            self.population.own_seeds,
-            range(before, due),
-            learning.batch_size,
-            learning.sequence_length,
+            self.population.own_seeds, due, learning.batch_size, learning.sequence_length
         ) as batches:
-            for update, batch in enumerate(batches, start=before):
+            for update, batch in zip(due, batches, strict=True):
                 previous = loss
                 self.state, self.sums, loss = self.population.update(self.state, self.sums, batch)
                 # One update ahead of the device, no more: the next batch is being prepared.
                 jax.block_until_ready(previous)
-                self._advance(updates=update + 1, averaged=self.counters.averaged + 1)
-                self._bar.update(updates=update + 1)
-                if stop.requested:
+                self._updated(range(update, update + 1))
+                if stop.requested if self._ahead is None else self._ahead.failed:
                     break
         jax.block_until_ready(loss)
-        self._time("update", started, updates=self.counters.updates - before)
-        if self.counters.updates == due:
-            self._write_averages()
+
+    def _updated(self, updates: range) -> None:
+        """Counts updates with these numbers, which have been made."""
+        averaged = self.counters.averaged + len(updates)
+        self.counters = dataclasses.replace(self.counters, updates=updates.stop, averaged=averaged)
+        self._bar.update(updates=updates.stop)
 
     def _write_averages(self) -> None:
         count, sums = self.counters.averaged, jax.device_get(self.sums)
         healthy = np.array(self.placement.own(self.state.healthy))
         newly_frozen = np.flatnonzero(self._healthy & ~healthy).tolist()
         self._healthy = healthy
-        for member in range(len(self.members)):
-            averages = {name: float(x[member]) / count for name, x in sums.items()}
-            row = {"kind": "update", **self._columns(member, self.counters.rounds), **averages}
-            self.writer.write(row)
-            self._warn(member, averages)
+        averages = {name: np.asarray(x, np.float64) / count for name, x in sums.items()}
+        learning, say = self.agent.config.learning, self._bar.message
+        self._rows.updated(averages, self.counters, healthy, learning, say)
         for member in newly_frozen:
-            chosen = self.members[member]
-            self._bar.message(
-                f"member {member} ({chosen.label}, seed {chosen.seed}) met a loss or gradient that "
-                f"is not finite by update {self.counters.updates}: it is frozen as it was before, "
-                "the others go on"
+            say(
+                f"{self._rows.named(member)} met a loss or gradient that is not finite by update "
+                f"{self.counters.updates}: it is frozen as it was before, the others go on"
             )
         self.sums = jax.tree.map(jnp.zeros_like, self.sums)
         self.counters = dataclasses.replace(self.counters, averaged=0)
@@ -405,60 +399,15 @@ class Run:
                 "rates or the gradient norm. The last healthy parameters are in its checkpoint"
             )
 
-    def _warn(self, member: int, averages: Mapping[str, float]) -> None:
-        """Says once for each member what keeps it from learning."""
-        found = warnings(averages, self.agent.config.learning, self.counters.updates)
-        for name, message in found.items():
-            if (member, name) not in self._warned:
-                self._warned.add((member, name))
-                chosen = self.members[member]
-                self._bar.message(
-                    f"member {member} ({chosen.label}, seed {chosen.seed}), update "
-                    f"{self.counters.updates}: {message}"
-                )
-
     def _evaluate(self) -> None:
         """One episode per task and member: the mode, without noise, up to the first fall."""
         self._bar.update(phase="evaluating")
         index = self.counters.evaluations + 1
         records = self._phase("evaluate", index)
         diagnosis = jax.device_get(self.population.diagnose(self.state.params, records, index))
-        scores = []
-        for member, task in np.ndindex(len(self.members), len(self.tasks)):
-            healthy, episode = bool(self._healthy[member]), episodes(records.at(member, task))[0]
-            knowledge = {name: float(x[member, task]) for name, x in diagnosis.items()}
-            scores.append(episode.score if healthy else math.nan)
-            row = {
-                "kind": "evaluation",
-                **self._columns(member, self.counters.rounds),
-                "task": self.tasks[task],
-                "return": scores[-1],
-                "length": episode.length if healthy else 0,
-                "fell": healthy and episode.fell,
-                **(knowledge if healthy else dict.fromkeys(knowledge, math.nan)),
-            }
-            self.writer.write(row)
-        evaluations = self.schedule.evaluations
-        stride = max(1, evaluations // max(1, self.videos))
-        if self.videos and (index % stride == 0 or index == evaluations):
-            self._write_video(records)
+        score = self._rows.evaluated(records, diagnosis, self.counters, self._healthy)
         # A long round may cross several multiples; they share one evaluation.
         steps = self.schedule.environment_steps(self.counters.rounds)
-        self._advance(evaluations=steps // self.schedule.config.evaluate_every)
-        self._bar.update(last_return=_known_mean(scores))
-
-    def _write_video(self, records: Records) -> None:
-        frames = records.image[:MAXIMUM_VIDEO_MEMBERS]
-        frames = frames.reshape(-1, *frames.shape[2:])
-        steps = self.schedule.environment_steps(self.counters.rounds)
-        path = self.directory / "videos" / f"evaluation_{steps:09d}.mp4"
-        write_video(path, tile(frames), fps=30)
-
-    def _time(self, what: str, started: float, **columns) -> None:
-        row = {
-            "kind": what,
-            "seconds": time.perf_counter() - started,
-            "env_steps": self.schedule.environment_steps(self.counters.rounds),
-            **columns,
-        }
-        self.writer.write_timing(row)
+        evaluations = steps // self.schedule.config.evaluate_every
+        self.counters = dataclasses.replace(self.counters, evaluations=evaluations)
+        self._bar.update(last_return=score)

@@ -24,9 +24,9 @@ from dreamer_jax.config import preset
 from dreamer_jax.devices import Placement, place
 from dreamer_jax.learning import AgentState
 from dreamer_jax.logs import read_metrics
-from dreamer_jax.population import Population
+from dreamer_jax.population import Member, Population
 from dreamer_jax.randomness import update_key
-from dreamer_jax.training import Member, Run
+from dreamer_jax.training import Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
 from experiments.runs import evaluate as evaluation
@@ -139,20 +139,22 @@ def assert_spread(tree, placement):
 
 
 def the_number_of_devices_does_not_matter(folder):
-    """In files, on the device, and with simulators on the host."""
-    for name, replay, make_env in (
-        ("files", "files", probe),
-        ("device", "device", probe),
-        ("host", "files", counting),
+    """In files, on the device, both with simulators on the host, and these beside updates."""
+    for name, replay, make_env, collect in (
+        ("files", "files", probe, "before"),
+        ("device", "device", probe, "before"),
+        ("host", "files", counting, "before"),
+        ("host-device", "device", counting, "before"),
+        ("host-beside", "device", counting, "beside"),
     ):
-        agent = Small(config_with(replay=replay), 2)
-        counts = (1, 8) if name == "host" else (1, 2, 4, 8)
+        agent = Small(config_with(replay=replay, collect=collect), 2)
+        counts = (1, 8) if make_env is counting else (1, 2, 4, 8)
         for devices in counts:
             run = trained(folder / f"{name}-{devices}", 8, devices, agent, make_env)
             assert run.placement.count == devices and run.counters.updates == 12
             if devices > 1:
                 assert_spread((run.state, run.sums, run.seeds), run.placement)
-            if devices > 1 and name == "device":
+            if devices > 1 and replay == "device":
                 assert_spread(run.device_rounds._held, run.placement)
             assert_alike(folder / f"{name}-1", folder / f"{name}-{devices}")
 
@@ -168,7 +170,11 @@ def a_device_trains_its_members_as_if_there_were_no_others(folder):
 
 def padding_is_nowhere_to_be_seen(folder):
     """7 members on 4 devices, 2 on each: nothing but the 7 is trained, counted or written."""
-    for name, replay, make_env in (("files", "files", probe), ("host", "files", counting)):
+    for name, replay, make_env in (
+        ("files", "files", probe),
+        ("host", "files", counting),
+        ("host-device", "device", counting),
+    ):
         agent = Small(config_with(replay=replay), 2)
         run = trained(folder / f"padded-{name}", 7, 4, agent, make_env)
         assert str(run.placement) == "7 members on 4 of 8 devices, at most 2 on each"

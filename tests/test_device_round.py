@@ -1,4 +1,5 @@
-"""Rounds as one program, with the replay on the device, beside the same rounds with files.
+"""Rounds with the replay on the device, beside the same rounds with files: as one program each, and
+with simulators on the host.
 
 P = 2 members, K = 2 tasks, 4 rounds; of each stream's 84 records the newest 25 are sampled, and the
 device has room for two phases of 21.
@@ -16,13 +17,14 @@ import pytest
 from dreamer_jax import device_replay, device_round
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
-from dreamer_jax.device_round import on_device, whole_round
+from dreamer_jax.device_round import on_device, store_and_update, whole_round
 from dreamer_jax.logs import read_metrics
+from dreamer_jax.population import Member
 from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 from dreamer_jax.schedule import Schedule
-from dreamer_jax.training import Member, Run
-from probes import Probe
+from dreamer_jax.training import Run
+from probes import BrokenProbe, Probe
 
 
 class Inside(Probe):
@@ -38,18 +40,19 @@ def config_with(**settings):
 
 
 # Shared, so that all runs of these tests share their compiled functions.
-AGENT, ENV = Agent(config_with(), 2), Inside()
+AGENT = Agent(config_with(), 2)
+ENVS = {"one program": Inside(), "host": Probe()}
 FILES = Agent(config_with(replay="files"), 2)
 MEMBERS = (Member(0, "one"), Member(7, "two"))
 TASKS = ("probe/left", "probe/right")
 
 
-def run_in(directory, agent=AGENT, **options):
-    return Run(agent, ENV, TASKS, MEMBERS, directory, **({"videos": 0} | options))
+def run_in(directory, env, agent=AGENT, **options):
+    return Run(agent, env, TASKS, MEMBERS, directory, **({"videos": 0} | options))
 
 
-def trained(directory, **options):
-    run = run_in(directory, **options)
+def trained(directory, env, **options):
+    run = run_in(directory, env, **options)
     outcome = run.train()
     run.close()
     return run, outcome
@@ -59,10 +62,15 @@ def metrics(directory):
     return (directory / "metrics.jsonl").read_bytes()
 
 
+@pytest.fixture(scope="module", params=ENVS, ids=lambda name: name.replace(" ", "_"))
+def env(request):
+    return ENVS[request.param]
+
+
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, env):
     directory = tmp_path_factory.mktemp("device")
-    run, outcome = trained(directory)
+    run, outcome = trained(directory, env)
     assert outcome == "finished"
     return directory, run
 
@@ -79,9 +87,9 @@ def assert_same(directory, other, rel):
             assert two[name] == value, (one["kind"], name)
 
 
-def test_a_round_as_one_program_gives_the_metrics_of_the_path_with_files(finished, tmp_path):
+def test_a_replay_on_the_device_gives_the_metrics_of_the_path_with_files(finished, env, tmp_path):
     directory, run = finished
-    other, outcome = trained(tmp_path, agent=FILES)
+    other, outcome = trained(tmp_path, env, agent=FILES)
     assert outcome == "finished" and run.device_rounds and not other.device_rounds
     kinds = {row["kind"] for row in read_metrics(directory)}
     assert kinds == {"collect", "update", "evaluation"} and run.counters.updates == 16
@@ -96,13 +104,15 @@ def test_a_round_as_one_program_gives_the_metrics_of_the_path_with_files(finishe
         assert held[0][:size] == held[1][:size] and len(held[0]) == len(held[1])
 
 
-def test_all_rounds_share_one_program(finished):
-    assert whole_round._cache_size() == 1
+def test_all_rounds_share_one_program(finished, env):
+    program = store_and_update if env.has_host else whole_round
+    assert program._cache_size() == 1
 
 
-def stopping_in(monkeypatch, rounds, what):
-    """Does something in the midst of the round of that number."""
-    original, left = device_round.whole_round, [rounds]
+def stopping_in(monkeypatch, env, rounds, what):
+    """Does something in the midst of the updates of the round of that number."""
+    name = "store_and_update" if env.has_host else "whole_round"
+    original, left = getattr(device_round, name), [rounds]
 
     def counting(*arguments, **options):
         left[0] -= 1
@@ -111,19 +121,21 @@ def stopping_in(monkeypatch, rounds, what):
             what()
         return result
 
-    monkeypatch.setattr(device_round, "whole_round", counting)
+    monkeypatch.setattr(device_round, name, counting)
 
 
 @pytest.mark.parametrize("agent", [AGENT, FILES], ids=["device", "files"])
-def test_a_run_stopped_by_ctrl_c_goes_on_with_either_replay(finished, tmp_path, agent, monkeypatch):
+def test_a_run_stopped_by_ctrl_c_goes_on_with_either_replay(
+    finished, env, tmp_path, agent, monkeypatch
+):
     directory, whole = finished
-    run = run_in(tmp_path)
+    run = run_in(tmp_path, env)
     with monkeypatch.context() as patch:
-        stopping_in(patch, 3, lambda: signal.raise_signal(signal.SIGINT))
+        stopping_in(patch, env, 3, lambda: signal.raise_signal(signal.SIGINT))
         assert run.train() == "stopped"
     run.close()
     assert (run.counters.rounds, run.counters.updates) == (3, 12)
-    resumed, outcome = trained(tmp_path, agent=agent, resume=True)
+    resumed, outcome = trained(tmp_path, env, agent=agent, resume=True)
     assert outcome == "finished"
     if agent is FILES:
         assert_same(directory, tmp_path, rel=1e-3)
@@ -143,23 +155,25 @@ def raising(error):
     return action
 
 
-def test_a_run_killed_between_checkpoints_equals_one_that_was_not(finished, tmp_path, monkeypatch):
+def test_a_run_killed_between_checkpoints_equals_one_that_was_not(
+    finished, env, tmp_path, monkeypatch
+):
     directory, whole = finished
-    run = run_in(tmp_path)
+    run = run_in(tmp_path, env)
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        stopping_in(patch, 3, raising(Killed()))
+        stopping_in(patch, env, 3, raising(Killed()))
         run.train()
     run.close()
-    resumed, _ = trained(tmp_path, resume=True)
+    resumed, _ = trained(tmp_path, env, resume=True)
     assert metrics(tmp_path) == metrics(directory)
     chex.assert_trees_all_equal(resumed.state, whole.state)
 
 
-def test_a_round_whose_records_cannot_be_written_ends_at_the_newest_checkpoint(
-    finished, tmp_path, monkeypatch
+def test_a_round_whose_records_cannot_be_written_ends_before_it(
+    finished, env, tmp_path, monkeypatch
 ):
     directory, whole = finished
-    run, append = run_in(tmp_path), Replay.append
+    run, append = run_in(tmp_path, env), Replay.append
     with monkeypatch.context() as patch:
 
         def full(self, records):
@@ -172,23 +186,39 @@ def test_a_round_whose_records_cannot_be_written_ends_at_the_newest_checkpoint(
             run.train()
     run.close()
     assert run.counters.updates == run.state.updates[0] == 8
-    resumed, _ = trained(tmp_path, resume=True)
+    resumed, _ = trained(tmp_path, env, resume=True)
     assert metrics(tmp_path) == metrics(directory)
     chex.assert_trees_all_equal(resumed.state, whole.state)
 
 
-def test_a_device_without_room_for_the_round_names_the_ways_out(tmp_path, monkeypatch):
+def test_a_device_without_room_for_the_round_names_the_ways_out(env, tmp_path, monkeypatch):
     error = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
-    stopping_in(monkeypatch, 1, raising(error))
-    run = run_in(tmp_path)
+    stopping_in(monkeypatch, env, 1, raising(error))
+    run = run_in(tmp_path, env)
     with pytest.raises(MemoryError, match="replay's .* MiB.*replay_keep.*mapping=chunks.*files"):
         run.train()
     run.close()
 
 
-def test_a_member_that_turns_not_finite_is_frozen_and_the_other_goes_on(finished, tmp_path, capsys):
+def test_a_failed_phase_loses_nothing_of_what_was_before_it(finished, env, tmp_path):
     directory, whole = finished
-    run = run_in(tmp_path)
+    broken = BrokenProbe(phases=4)  # two of rounds, two of evaluations
+    broken.has_host = env.has_host
+    run = run_in(tmp_path, broken)
+    with pytest.raises(RuntimeError, match="probe/point died"):
+        run.train()
+    run.close()
+    assert (run.counters.rounds, run.counters.updates) == (2, 8)
+    resumed, _ = trained(tmp_path, env, resume=True)
+    assert metrics(tmp_path) == metrics(directory)
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_member_that_turns_not_finite_is_frozen_and_the_other_goes_on(
+    finished, env, tmp_path, capsys
+):
+    directory, whole = finished
+    run = run_in(tmp_path, env)
     poisoned = run.state.params["reward"]["out"]["bias"].at[1].set(jnp.nan)
     run.state.params["reward"]["out"]["bias"] = poisoned
     assert run.train() == "finished"
@@ -201,18 +231,27 @@ def test_a_member_that_turns_not_finite_is_frozen_and_the_other_goes_on(finished
     chex.assert_trees_all_equal(*(jax.tree.map(lambda x: x[0], r.state) for r in (run, whole)))
 
 
-def test_the_replay_is_updated_in_place_and_read_without_a_copy(finished):
+def test_the_replay_is_updated_in_place_and_read_without_a_copy(finished, env):
     """With room for many more records than a round looks at, the program's memory beside its
     arguments stays below that of the replay."""
     _, run = finished
-    held = jax.eval_shape(lambda: device_replay.empty(2, 2, 21 * 200, 32, 2))
+    held, records = (
+        jax.eval_shape(lambda count=count: device_replay.empty(2, 2, count, 32, 2))
+        for count in (21 * 200, 21)
+    )
     size = sum(x.size * x.dtype.itemsize for x in held)
     drawn = jax.ShapeDtypeStruct((4, 2, 2), jnp.int32)
     scalar = jax.ShapeDtypeStruct((), jnp.int32)
-    program = whole_round.lower(
-        AGENT, ENV, run.state, run.sums, held, run.seeds, scalar, scalar, scalar, (drawn, drawn),
-        ticks=20, length=5, mapping="auto", chunk=1,
-    )  # fmt: skip
+    taken, options = (run.state, run.sums, held), {"length": 5, "mapping": "auto", "chunk": 1}
+    if env.has_host:
+        program = store_and_update.lower(
+            AGENT, *taken, records, scalar, scalar, (drawn, drawn), **options
+        )
+    else:
+        program = whole_round.lower(
+            AGENT, env, *taken, run.seeds, scalar, scalar, scalar, (drawn, drawn),
+            ticks=20, **options,
+        )  # fmt: skip
     assert "callback" not in program.as_text()
     memory = program.compile().memory_analysis()
     assert memory.alias_size_in_bytes > size
@@ -259,39 +298,43 @@ def choice(setting, has_host=False):
     return on_device(Agent(config_with(replay=setting), 2), has_host, 2, 2)
 
 
-def test_an_environment_with_a_host_is_refused_unless_files_are_a_choice():
-    with pytest.raises(ValueError, match="on the host: choose replay=files, or tasks such as brax"):
-        choice("device", True)
-    assert choice("auto", True) == choice("files", True) == (False, "")
+def test_only_an_environment_without_a_host_makes_a_round_one_program():
+    for has_host in (True, False):
+        assert choice("device", has_host)[:2] == (True, not has_host)
+        assert choice("files", has_host) == (False, False, "")
 
 
-def test_an_environment_that_does_not_say_is_taken_to_have_a_host(tmp_path):
-    with pytest.raises(ValueError, match="choose replay=files"):
-        Run(AGENT, Probe(), TASKS, MEMBERS, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+def test_an_environment_that_does_not_say_is_taken_to_have_a_host(tmp_path, monkeypatch):
+    monkeypatch.delattr(Probe, "has_host")
+    run = run_in(tmp_path, Probe())
+    assert run.device_rounds is not None
+    monkeypatch.setattr(device_round, "whole_round", raising(AssertionError("one program")))
+    assert run.train() == "finished"
+    run.close()
 
 
 def test_the_cpu_keeps_files_unless_told_otherwise():
-    assert choice("auto") == (False, "")
+    assert choice("auto") == choice("auto", True) == (False, False, "")
     # 168 records of 32 * 32 * 3 pixels, two actions, a reward and two flags.
     size = 2 * 2 * 42 * (3072 + 8 + 4 + 2) / 2**20
-    assert choice("device") == (
-        True,
-        f"replay on the device: {size:.1f} MiB (members 2, tasks 2, records 42 of 32 x 32 pixels)",
+    assert choice("device").note == (
+        f"replay on the device: {size:.1f} MiB (members 2, tasks 2, records 42 of 32 x 32 pixels)"
     )
 
 
-def test_accelerators_hold_a_replay_that_takes_half_of_their_memory_at_most(monkeypatch):
+@pytest.mark.parametrize("has_host", [False, True])
+def test_accelerators_hold_a_replay_that_takes_half_of_their_memory_at_most(monkeypatch, has_host):
     size = 2 * 2 * 42 * 3086
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     for memory, outcome in ((2 * size, True), (2 * size - 2, False)):
         monkeypatch.setattr(device_round, "_memory", lambda memory=memory: memory)
-        chosen, note = choice("auto")
-        assert chosen is outcome
-        assert ("in files" in note and "more than half of its" in note) is not outcome
+        chosen = choice("auto", has_host)
+        assert chosen.device is outcome
+        told = "in files" in chosen.note and "more than half of its" in chosen.note
+        assert told is not outcome
     monkeypatch.setattr(device_round, "_memory", lambda: size - 1)
     with pytest.raises(ValueError, match=r"would take 0.5 MiB.*has 0.5 MiB.*replay_keep, less th"):
-        choice("device")
+        choice("device", has_host)
 
 
 def test_the_capacity_is_whole_phases_of_what_is_sampled():

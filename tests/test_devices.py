@@ -13,9 +13,9 @@ import pytest
 
 from dreamer_jax import devices
 from dreamer_jax.devices import on_one_device, place
-from dreamer_jax.population import Population, update_members
+from dreamer_jax.population import Member, Population, update_members
 from dreamer_jax.rollout import collect
-from dreamer_jax.training import Member, Run
+from dreamer_jax.training import Run
 from experiments.cli.main import main
 from over_devices import LAWS, TASKS, Inside, Small, config_with
 from runs import batch_for

@@ -18,6 +18,7 @@ from dreamer_jax.prefetch import Prefetcher
 from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 from dreamer_jax.sampling import sample_indices
+from dreamer_jax.stream_reader import Place, StreamReader
 
 SIZE, ACTION = 8, 2
 
@@ -432,6 +433,67 @@ def test_a_batch_handed_out_is_never_written_again(tmp_path):
     for name, array in batch._asdict().items():
         assert type(array) is np.ndarray and array.flags.owndata
         assert not any(np.shares_memory(array, getattr(other, name)) for other in others)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 50])
+def test_a_batch_is_the_same_however_many_threads_put_it_together(tmp_path, threads):
+    expected = make(tmp_path, members=3, threads=1)
+    replay = make(tmp_path, members=3, steps=(), threads=threads)
+    for update in range(5):
+        assert_same(
+            replay.sample([3, 4, 5], update, 7, 6), expected.sample([3, 4, 5], update, 7, 6)
+        )
+    assert_same(replay.sample([4], 0, 1, 6, members=[2]), expected.sample([4], 0, 1, 6, [2]))
+    replay.close()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("replay")]
+    assert_same(replay.sample([3, 4, 5], 9, 7, 6), expected.sample([3, 4, 5], 9, 7, 6))
+    replay.close()
+
+
+def test_threads_are_as_many_as_cores_but_no_more_than_four(monkeypatch):
+    cores = {1: 1, 3: 3, 64: 4}
+    for there, expected in cores.items():
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, n=there: set(range(n)), False)
+        assert StreamReader(np.dtype("u1")).threads == expected
+
+
+def mapped(directory):
+    """The files in a folder that this process maps, as often as it does."""
+    with open("/proc/self/maps") as maps:
+        return [line.split()[-1] for line in maps if str(directory) in line]
+
+
+needs_proc = pytest.mark.skipif(not os.path.exists("/proc/self/maps"), reason="needs Linux's /proc")
+
+
+@needs_proc
+def test_files_stay_mapped_once_each_and_no_map_outlives_a_truncation(tmp_path):
+    replay = make(tmp_path)
+    for update in range(5):
+        replay.sample([0, 1], update, 8, 6)
+    assert sorted(mapped(tmp_path)) == sorted(str(replay.path(*x)) for x in np.ndindex(2, 2))
+    # What is appended is found through a map that reaches so far.
+    replay.append(phase(2, 2, 9, start=30))
+    assert_same(replay.read(1, 1, 30, 39), phase(2, 2, 9, start=30).at(1, 1))
+    replay.truncate(replay.lengths - 1)
+    assert not mapped(tmp_path)
+    replay.sample([0, 1], 0, 8, 6)
+    replay.close()
+    assert not mapped(tmp_path)
+
+
+@needs_proc
+def test_of_many_files_those_that_were_read_last_stay_mapped(tmp_path):
+    replay = make(tmp_path, members=3)
+    reader = StreamReader(replay.dtype, threads=1, most_maps=2)
+    streams = list(np.ndindex(3, 2)) + [(2, 0)]
+    places = [Place(replay.path(*stream), 30, 4) for stream in streams]
+    found = reader.sequences(places, 5, 7)
+    for row, stream in enumerate(streams):
+        assert_same(found.at(row), replay.read(*stream, 4, 9))
+    replay.close()
+    assert sorted(mapped(tmp_path)) == [str(replay.path(*x)) for x in ((2, 0), (2, 1))]
+    reader.close()
 
 
 def anonymous_bytes():

@@ -13,6 +13,7 @@ import pytest
 from dreamer_jax.checkpoint import Checkpointer, CorruptCheckpointError
 from envs import SimulatorError
 from experiments.runs import memory
+from experiments.runs.agents import make_agent
 from experiments.runs.folder import folders
 from experiments.thesis import estimate, jobs
 from experiments.thesis.engines import local
@@ -179,6 +180,22 @@ def test_an_estimate_is_what_can_be_counted_by_hand(tmp_path):
     # Records of 32 x 32 x 3 bytes, three actions, a reward and two flags: 21 a phase.
     records = 6 * 4 * 21 * (32 * 32 * 3 + 4 * 3 + 4 + 2)
     assert records < found.disk < records + 2 * 6 * 10**6
+
+
+def test_what_a_schedule_keeps_on_the_device_counts_as_its_memory(tmp_path):
+    _, run, *_ = plan(tmp_path)
+    config = run.spec.config
+
+    def needed(**settings):
+        schedule = dataclasses.replace(config.schedule, **settings)
+        spec = dataclasses.replace(run.spec, config=dataclasses.replace(config, schedule=schedule))
+        return estimate.estimate(dataclasses.replace(run, spec=spec), SPEED).memory
+
+    # The same records as on the disk; and agents from before the updates.
+    records = 6 * 4 * 21 * (32 * 32 * 3 + 4 * 3 + 4 + 2)
+    assert needed(replay="device") - needed() == records
+    kept = 6 * memory.member_bytes(make_agent(run.spec))
+    assert needed(collect="beside") - needed() == kept
 
 
 def test_time_is_linear_in_each_speed_and_falls_with_what_is_done(tmp_path):

@@ -16,9 +16,9 @@ from dreamer_jax import population
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.logs import read_metrics
-from dreamer_jax.population import update_members
+from dreamer_jax.population import Member, update_members
 from dreamer_jax.schedule import Counters, Schedule
-from dreamer_jax.training import Member, NonFiniteError, Run
+from dreamer_jax.training import NonFiniteError, Run
 from probes import BrokenProbe, Probe, Walk
 
 CONFIG = preset("debug")

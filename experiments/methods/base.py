@@ -22,7 +22,7 @@ from dreamer_jax.ranges import Range
 if TYPE_CHECKING:
     import transfer
     from dreamer_jax.agent import Agent
-    from dreamer_jax.training import Member
+    from dreamer_jax.population import Member
 
 BASELINE = "baseline"
 """The label of agents from scratch."""
@@ -188,7 +188,7 @@ class Method:
 
     def members(self, seeds: Sequence[int]) -> "tuple[Member, ...]":
         """The population: one target for each combination and seed; then the baseline."""
-        from dreamer_jax.training import Member
+        from dreamer_jax.population import Member
 
         scratch = [Member(seed, BASELINE) for seed in seeds] if self.baseline else []
         marked = [(values["seed"], *self.mark(values)) for values in self.targets(seeds)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import envs
-from dreamer_jax.training import MAXIMUM_VIDEO_MEMBERS
+from dreamer_jax.run_rows import MAXIMUM_VIDEO_MEMBERS
 from experiments.reports.outcomes import Run
 from experiments.runs.evaluate import SHOWN_MEMBERS
 from experiments.runs.spec import RunSpec

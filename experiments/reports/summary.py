@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import envs
-from dreamer_jax.training import Member
+from dreamer_jax.population import Member
 from experiments.methods import BASELINE
 from experiments.reports.curves import Curve, Panel, draw_panels
 from experiments.reports.outcomes import Outcome, Run

@@ -102,7 +102,7 @@ def room_for(agent: Agent, tasks: int, members: int, has_host: bool) -> int | No
         return None
     update_bytes = max(1, compiled_update(agent).memory_analysis().temp_size_in_bytes)
     taken = bytes_of(agent, tasks, members, 0, update_bytes)
-    if on_device(agent, has_host, tasks, members)[0]:
+    if on_device(agent, has_host, tasks, members).device:
         taken += replay_bytes(agent, tasks, members)
     return max(1, int(MEMORY_SHARE * limit - taken) // update_bytes)
 

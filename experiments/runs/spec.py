@@ -17,13 +17,14 @@ from experiments.methods.base import Method, require
 from experiments.methods.scratch import Scratch
 
 if TYPE_CHECKING:
-    from dreamer_jax.training import Member
+    from dreamer_jax.population import Member
 
 Mapped = Literal["auto", "vmap", "chunks"]
 """The setting `mapping`."""
 
-OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk")
-"""How members are mapped depends on the machine and changes no result but by rounding."""
+OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk", "schedule.replay_threads")
+"""How members are mapped and batches are put together depends on the machine, and changes no result
+but by rounding."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import jax
 
+import envs
+from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.devices import Choice, place
 from dreamer_jax.schedule import Schedule
 from experiments.runs.agents import make_agent
@@ -61,6 +63,11 @@ def estimate(run: PlannedRun, speed: Speed, devices: Choice = "all") -> Estimate
     disk = slots * records * record_bytes(agent)
     disk += CHECKPOINTS * members * member_bytes(agent)
     memory = bytes_of(agent, tasks, each, at_once(agent, each), speed.update_bytes)
+    has_host = any(task.has_host for task in envs.specs(spec.tasks))
+    if on_device(agent, has_host, tasks, each).device:
+        memory += replay_bytes(agent, tasks, each)
+    if schedule.collect == "beside":
+        memory += each * member_bytes(agent)  # of agents as they were before the updates
     seconds += speed.compile_seconds + sum(speed.tick_compile_seconds[task] for task in spec.tasks)
     return Estimate(seconds, memory, disk)
 

@@ -20,6 +20,8 @@ KINDS = {
     "two tasks": ("--task", "bullet/inverted_pendulum", "bullet/hopper"),
     "population": ("--task", "bullet/inverted_pendulum", "--seeds", "0", "1", "2"),
     "old records deleted": ("--task", "bullet/inverted_pendulum", "--replay-keep", "50"),
+    "device": ("--task", "bullet/inverted_pendulum", "--replay", "device"),
+    "beside": ("--task", "bullet/inverted_pendulum", "--replay", "device", "--collect", "beside"),
     "uae": ("--task", "bullet/inverted_pendulum", "--method", "uae", "--source", "{source}"),
     "meta": ("--task", "bullet/inverted_pendulum", "--method", "meta", "--source", "{source}")
     + ("--reward-sources", "{uae}"),
