@@ -29,11 +29,11 @@ endif
 ON := $(addprefix +,$(filter-out cpu,$(ACCELERATOR)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint hooks docs tables figures plan train sweep evaluate report bench clean
+.PHONY: help setup demo test lint hooks docs tables figures plan train sweep evaluate report bench bench-accelerator clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/%/N/; s/:.*## /|/' | \
-	  awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
+	  awk -F'|' '{printf "  make %-17s %s\n", $$1, $$2}'
 
 # One stamp per set of extras, so that the demo installs no test tools.
 $(VENV)/bin/python:
@@ -105,6 +105,9 @@ report: $(STAMP)bullet$(ON)  ## Print the table of OUT and draw its learning cur
 
 bench: $(STAMP)bullet+brax+gymnasium+dev$(ON)  ## Run the benchmarks and write runs/benchmarks/table.md (an hour)
 	$(RUN) -m benchmarks runs/benchmarks $(ARGS)
+
+bench-accelerator: $(STAMP)brax$(ON)  ## Measure a card into runs/accelerator.md (20 minutes), with ACCELERATOR=cuda12
+	@$(STOPPABLE) $(RUN) -m benchmarks accelerator $(ARGS)
 
 clean:  ## Remove .venv and caches; runs/ and results/ stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .hypothesis *.egg-info site

@@ -3,6 +3,10 @@
 OUT is a folder (runs/benchmarks by default): lines.jsonl takes what each benchmark prints,
 table.md what people read. Names choose among the benchmarks below; all run by default. One that
 fails is named at the end, and the others go on.
+
+    python -m benchmarks accelerator --help
+
+is a command of its own, which measures a card in at most 20 minutes.
 """
 
 import datetime
@@ -55,6 +59,10 @@ def rows(name: str, line: dict) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
+    if arguments[:1] == ["accelerator"]:
+        from benchmarks.accelerator import command
+
+        return command.main(arguments[1:])
     names = [word for word in arguments if word in COMMANDS] or list(COMMANDS)
     folders = [word for word in arguments if word not in COMMANDS]
     if len(folders) > 1:

@@ -12,18 +12,23 @@ import shlex
 import statistics
 import subprocess
 import sys
+from typing import Any
 
 from benchmarks.update import read_arguments
 
 DEFAULTS = {"rounds": 3, "figure": "s_per_update"}
 
 
-def figure_of(command: str, name: str) -> float:
-    """The figure of that name in the last line that a command prints."""
+def line_of(command: str) -> dict[str, Any]:
+    """The last line that a command prints, which is JSON.
+
+    Raises:
+      RuntimeError: it failed; holds what it said.
+    """
     done = subprocess.run(shlex.split(command), capture_output=True, text=True)
     if done.returncode:
-        sys.exit(f"error: {command} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])[name]
+        raise RuntimeError(f"{command} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def main():
@@ -31,7 +36,12 @@ def main():
     if len(commands) < 2:
         sys.exit(__doc__)
     a = read_arguments(rest, DEFAULTS)
-    rounds = [[figure_of(command, a["figure"]) for command in commands] for _ in range(a["rounds"])]
+    try:
+        rounds = [
+            [line_of(command)[a["figure"]] for command in commands] for _ in range(a["rounds"])
+        ]
+    except RuntimeError as error:
+        sys.exit(f"error: {error}")
     first, second = (statistics.median(values) for values in zip(*rounds, strict=True))
     result = {
         "benchmark": "beside",

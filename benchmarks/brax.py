@@ -26,7 +26,7 @@ import jax.numpy as jnp
 
 import envs
 from dreamer_jax.agent import Agent
-from dreamer_jax.config import preset
+from dreamer_jax.config import Config, preset
 from dreamer_jax.population import init_members
 from dreamer_jax.rollout import collect
 
@@ -63,18 +63,24 @@ class Clock:
 class Rollout:
     """The compiled phase of one task, as a run collects it.
 
+    Args:
+      name: of the task.
+      config: the agents' settings.
+      members: P, all of them with one agent's parameters, which are mapped nevertheless.
+      steps: agent steps of a phase.
+
     Attributes:
       trace, compile: processor seconds that these took.
+      compile_seconds: of the clock, for both.
     """
 
-    def __init__(self, name: str, members: int, image_size: int, steps: int):
-        config = preset("cpu")
-        config = replace(config, network=replace(config.network, image_size=image_size))
-        self._env = envs.make([name], members, image_size, workers=1)
+    def __init__(self, name: str, config: Config, members: int, steps: int):
+        self._env = envs.make([name], members, config.network.image_size, workers=1)
         agent = Agent(config, self._env.action_size)
         seeds, number = jnp.arange(members), jnp.int32(0)
-        state = init_members(agent, seeds)
-        self._arguments = (state.params, seeds, state.updates, number)
+        one = init_members(agent, jnp.arange(1)).params
+        params = jax.tree.map(lambda x: jnp.repeat(x, members, axis=0), one)
+        self._arguments = (params, seeds, jnp.zeros_like(seeds), number)
 
         def phase(params, seeds, updates, number):
             return collect(
@@ -82,12 +88,13 @@ class Rollout:
                 mode="explore",
             )  # fmt: skip
 
-        started = time.process_time()
+        began, started = time.perf_counter(), time.process_time()
         lowered = jax.jit(phase).lower(*self._arguments)
         self.trace = time.process_time() - started
         started = time.process_time()
         self._program = lowered.compile()
         self.compile = time.process_time() - started
+        self.compile_seconds = time.perf_counter() - began
         pool = getattr(self._env, "_pool", None)
         self._clock = Clock(worker.process.pid for worker in pool._workers) if pool else Clock()
 
@@ -96,6 +103,11 @@ class Rollout:
         found = self._clock.seconds(self._program, *self._arguments)
         self._env.check()
         return found
+
+    def play(self) -> None:
+        """The phase, to its end."""
+        jax.block_until_ready(self._program(*self._arguments))
+        self._env.check()
 
     def close(self) -> None:
         self._env.close()
@@ -131,11 +143,12 @@ class Rays:
 
 def result(name: str, members: int, image_size: int, steps: int, repetitions: int) -> dict:
     """What there is to say of one task at one size."""
-    sizes = (members, image_size, steps)
+    config = preset("cpu")
+    config = replace(config, network=replace(config.network, image_size=image_size))
     parts = {
-        "rays": Rollout(name, *sizes),
-        "mujoco": Rollout(f"{name}:mujoco", *sizes),
-        "drawing": Rays(name, *sizes),
+        "rays": Rollout(name, config, members, steps),
+        "mujoco": Rollout(f"{name}:mujoco", config, members, steps),
+        "drawing": Rays(name, members, image_size, steps),
     }
     # The first of each warms up.
     turns = [{part: one.seconds() for part, one in parts.items()} for _ in range(repetitions + 1)]

@@ -14,7 +14,7 @@ from dreamer_jax.config import preset
 from dreamer_jax.schedule import Schedule
 from experiments.runs import memory
 from experiments.runs.agents import make_agent
-from experiments.thesis import flops, grid
+from experiments.thesis import grid, measurement
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import FIGURES, TABLES, closure, shown
 
@@ -26,10 +26,7 @@ CARDS, OF_CARDS = 64, 500e12
 CONFIG = preset("thesis")
 
 
-@functools.cache
-def operations(agent) -> float:
-    """Of one update of one member."""
-    return flops.of_jaxpr(memory.traced_update(agent)[0].jaxpr.jaxpr)
+operations = functools.cache(measurement.operations)
 
 
 def work_of(cells):

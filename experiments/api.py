@@ -42,9 +42,10 @@ from envs.pixel_env import PixelEnv
 from experiments import methods
 from experiments.runs import evaluate as evaluation
 from experiments.runs.agents import load_source, make_agent
-from experiments.runs.memory import in_memory
+from experiments.runs.memory import in_memory, mapped
 from experiments.runs.run import carry_out, make_run
 from experiments.runs.spec import RunSpec
+from experiments.runs.ways_out import CALL
 
 RUNS = Path("runs")
 """Where runs are kept that are given no folder."""
@@ -216,25 +217,36 @@ def transfer(
     if "reward_sources" in own:
         own["reward_sources"] = tuple(map(_folder, own["reward_sources"]))
     made = methods.make(method, {"sources": names, **own})
-    config = _with(load_source(names[0], made.source_member).spec.config, settings)
+    # But for how members are mapped: that was right for the source's population.
+    source_spec = mapped(load_source(names[0], made.source_member).spec, "auto", 1)
+    config = _with(source_spec.config, settings)
     spec = RunSpec(_several(task, str), _several(seeds, int), config, made)
     return _run(spec, out, workers, devices)
 
 
 def evaluate(
-    trained: Trained | str | Path, episodes: int = 5, *, workers: int | None = None
+    trained: Trained | str | Path,
+    episodes: int = 5,
+    *,
+    workers: int | None = None,
+    devices: Choice = "all",
 ) -> list[dict[str, Any]]:
     """Plays whole episodes with every agent of a run: the mode, without noise.
+
+    Args:
+      trained: a run, or its folder.
+      episodes: of each agent on each task.
+      workers, devices: as for `train`.
 
     Returns:
       One row per agent, task and episode: member, seed, label, task, episode, return, length,
       fell.
 
     Raises:
-      ValueError: the folder holds no run or no checkpoint.
+      ValueError: the folder holds no run or no checkpoint, or there are not so many devices.
     """
     agents = evaluation.load_agents(_folder(trained))
-    return evaluation.evaluate(agents, episodes, workers=workers)
+    return evaluation.evaluate(agents, episodes, workers=workers, devices=devices)
 
 
 def load(trained: Trained | str | Path, member: int = 0) -> Player:
@@ -280,16 +292,17 @@ def _with(config: Config, settings: Mapping[str, Any]) -> Config:
 def _run(spec: RunSpec, out: str | Path | None, workers: int | None, devices: Choice) -> Trained:
     """Carries out a run, or what is left of it."""
     directory = RUNS / _name(spec) if out is None else Path(out)
-    if spec.config.schedule.mapping == "auto":
-        spec = in_memory(spec, devices)
+    spec = in_memory(spec, devices)
     run = make_run(spec, directory, resume=True, workers=workers, devices=devices)
-    if carry_out(run) == "stopped":
+    if carry_out(run, CALL) == "stopped":
         raise KeyboardInterrupt(f"stopped and saved in {directory}: the same call goes on")
     return Trained(directory, spec)
 
 
 def _name(spec: RunSpec) -> str:
-    """A name that no other run has: tasks, method, and a digest of all settings."""
+    """A name that no other run has: tasks, method, and a digest of all settings but those of the
+    machine."""
+    spec = mapped(spec, "auto", 1)
     digest = hashlib.sha256(json.dumps(spec.to_dict(), sort_keys=True).encode()).hexdigest()
     titles = "+".join(task.replace("/", "-") for task in spec.tasks)
     return f"{titles}-{spec.method.NAME}-{digest[:8]}"

@@ -19,6 +19,7 @@ if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
 os.environ["XLA_FLAGS"] = " ".join(_flags).strip()
 
 LONGEST = (
+    "test_accelerator",
     "test_brax",
     "test_tables",
     "test_methods_command_line",

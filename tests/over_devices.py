@@ -14,13 +14,14 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
 from dreamer_jax import population
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from dreamer_jax.config import preset
-from dreamer_jax.devices import place
+from dreamer_jax.devices import Placement, place
 from dreamer_jax.learning import AgentState
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Member, Population
@@ -28,8 +29,11 @@ from dreamer_jax.randomness import update_key
 from dreamer_jax.training import Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
+from experiments.runs import evaluate as evaluation
+from experiments.runs.evaluate import load_agents
+from experiments.runs.start import load_sources, transferred_members
 from probes import Probe
-from runs import batch_for
+from runs import batch_for, spec_of, write_run
 
 DEBUG = preset("debug")
 TASKS = ("probe/left", "probe/right")
@@ -238,6 +242,67 @@ def the_real_update_is_the_same_on_a_device_of_its_own(folder):
         np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-3, atol=1e-5)
 
 
+def agents_are_evaluated_on_their_devices_as_on_one(folder):
+    """5 members on 1 and on 3 devices, 2 on each: the same episodes, and padding in none."""
+    spec = spec_of("inverted_pendulum", seeds=(0, 1, 2, 3, 4))
+    write_run(folder / "evaluated", spec)
+    agents, shards = load_agents(folder / "evaluated"), []
+    make_env = evaluation.make_env
+
+    def watched(*arguments, **options):
+        shards.append(make_env(*arguments, **options))
+        return shards[-1]
+
+    evaluation.make_env = watched
+    one, three = (evaluation.evaluate(agents, 1, devices=devices) for devices in (1, 3))
+    evaluation.make_env = make_env
+    assert [env.shards for env in shards] == [1, 3]
+    assert len(one) == len(three) == 5
+    for row, other in zip(one, three, strict=True):
+        assert other.pop("return") == pytest.approx(row.pop("return"), rel=1e-3)
+        assert other == row
+
+
+def targets_begin_on_their_own_devices_as_on_one(folder):
+    """Each device makes its own members: of two sources with agents from scratch beside them, and
+    of stored models that each target has of its own."""
+    for seed, name in enumerate(("one", "two")):
+        write_run(folder / name, spec_of("hopper"), seed)
+    sources = (folder / "one", folder / "two")
+    write_run(folder / "uae", spec_of("hopper", "ant"))
+    for task in ("hopper", "ant"):
+        write_run(folder / task, spec_of(task, sources=(folder / "uae",), method="uae"))
+    stored = (folder / "hopper", folder / "ant")
+    meta = {"sources": (folder / "uae",), "reward_sources": stored, "method": "meta"}
+    for spec in (
+        spec_of("ant", sources=sources, omegas=(0.0, 0.2), baseline=True),
+        spec_of("walker2d", seeds=(0, 1, 2), **meta),
+    ):
+        read, placement = load_sources(spec), place(len(spec.members), 2)
+        assert placement.padded == len(spec.members) + 1
+        (state, report), (other, told) = (
+            transferred_members(spec, read, placement=where)
+            for where in (place(len(spec.members), 1), placement)
+        )
+        assert told.members == report.members == len(spec.method.targets(spec.seeds))
+        assert told.rows == report.rows
+        for one, two in zip(*map(jax.tree.leaves, ((state, report), (other, told))), strict=True):
+            np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-5, atol=1e-6)
+        assert_made_apart(spec, read, placement)
+
+
+def assert_made_apart(spec, sources, placement):
+    """What devices made was divided among them before it came to the host."""
+    seen, own = [], Placement.own
+    Placement.own = lambda self, tree: seen.append(tree) or own(self, tree)
+    try:
+        transferred_members(spec, sources, placement=placement)
+    finally:
+        Placement.own = own
+    ((state, report),) = seen
+    assert_spread((state, report), placement)
+
+
 def members_that_are_few_leave_devices_alone(folder):
     told = {(3, "all"): (3, 1), (9, "all"): (5, 2), (8, 3): (3, 3), (16, "all"): (8, 2)}
     for (members, choice), (count, each) in told.items():
@@ -254,6 +319,8 @@ LAWS = (
     killed_on_many_devices_a_run_goes_on_with_fewer,
     a_replay_on_the_devices_is_filled_from_files_of_another_number,
     the_real_update_is_the_same_on_a_device_of_its_own,
+    agents_are_evaluated_on_their_devices_as_on_one,
+    targets_begin_on_their_own_devices_as_on_one,
 )
 
 if __name__ == "__main__":

@@ -96,7 +96,7 @@ class Trainer:
     def __init__(self, failing=None, stop_at=None):
         self.failing, self.stop_at, self.trained = failing or {}, stop_at, []
 
-    def __call__(self, run, root, workers):
+    def __call__(self, run, root, means):
         self.trained.append(run.name)
         if run.name == self.stop_at:
             finish(run, root, share=0.5)

@@ -25,7 +25,7 @@ def asked(monkeypatch):
         found.append((spec, directory))
 
     monkeypatch.setattr(api, "make_run", note)
-    monkeypatch.setattr(api, "carry_out", lambda run: "finished")
+    monkeypatch.setattr(api, "carry_out", lambda *_: "finished")
     return found
 
 

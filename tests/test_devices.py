@@ -88,7 +88,7 @@ def test_an_environment_for_other_devices_is_refused_before_anything_is_written(
         ("some", "some"),
     ],
 )
-@pytest.mark.parametrize("command", ["train", "table", "demo"])
+@pytest.mark.parametrize("command", ["train", "table", "demo", "evaluate"])
 def test_devices_that_are_not_there_end_with_code_2_before_anything_is_written(
     tmp_path, monkeypatch, capsys, command, given, message
 ):
@@ -97,9 +97,11 @@ def test_devices_that_are_not_there_end_with_code_2_before_anything_is_written(
         "train": ["train", "--task", "bullet/hopper", "--out", "run"],
         "table": ["table", "3", "--seeds", "0"],
         "demo": ["demo"],
+        "evaluate": ["evaluate", "run"],
     }[command]
+    preset = [] if command == "evaluate" else ["--preset", "debug"]
     try:
-        code = main([*words, "--preset", "debug", "--devices", given])
+        code = main([*words, *preset, "--devices", given])
     except SystemExit as error:
         code = error.code
     assert code == 2

@@ -4,7 +4,9 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import pytest
 
+from dreamer_jax import convolutions
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from experiments.thesis import measurement
@@ -28,6 +30,35 @@ def test_a_convolution_counts_its_kernel_for_each_output():
         )
 
     assert count(convolve, shape(2, 8, 8, 3), shape(4, 4, 3, 6)) == 2 * (2 * 3 * 3 * 6) * 4 * 4 * 3
+
+
+def test_the_zeros_of_a_transposed_convolution_count_nothing():
+    def convolve(image, kernel):
+        return jax.lax.conv_transpose(image, kernel, (2, 2), "VALID")
+
+    # Each of the 5 x 5 pixels meets each of the 6 x 6 weights, for each pair of channels.
+    expected = 2 * (7 * 5 * 5) * (6 * 6) * (4 * 3)
+    assert count(convolve, shape(7, 5, 5, 4), shape(6, 6, 4, 3)) == expected
+
+    def gradients(image, kernel):
+        return jax.grad(lambda *x: convolve(*x).sum(), argnums=(0, 1))(image, kernel)
+
+    # The sum is one number for each of the 14 x 14 pixels, and so is its gradient; beside them the
+    # result and two gradients, of as many products each.
+    others = 2 * 7 * 14 * 14 * 3
+    assert 3 * expected <= count(gradients, shape(7, 5, 5, 4), shape(6, 6, 4, 3))
+    assert count(gradients, shape(7, 5, 5, 4), shape(6, 6, 4, 3)) < 3 * expected + 2 * others
+
+
+def test_an_update_is_as_much_arithmetic_with_the_layers_of_accelerators(monkeypatch):
+    config = preset("cpu")
+    here = measurement.operations(Agent(config, 2))
+    monkeypatch.setattr(convolutions, "default_method", lambda: "library")
+    # Another agent of the same sizes, of which no trace is kept.
+    learning = dataclasses.replace(config.learning, discount=0.98)
+    there = measurement.operations(Agent(dataclasses.replace(config, learning=learning), 2))
+    assert there != here
+    assert there == pytest.approx(here, rel=0.1)
 
 
 def test_loops_count_every_turn_and_functions_what_is_in_them():

@@ -63,7 +63,7 @@ def test_other_failures_keep_their_exit_code(make):
 
 
 TARGETS = """setup demo table-3 figure-12 tables figures plan test lint hooks docs train sweep
-evaluate report bench""".split()
+evaluate report bench bench-accelerator""".split()
 
 
 def planned(tmp_path, target, **settings):

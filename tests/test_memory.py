@@ -9,10 +9,14 @@ import pytest
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.training import Run
+from experiments import api
 from experiments.cli.main import main
 from experiments.runs import memory
 from experiments.runs.memory import OutOfMemoryError
 from experiments.runs.run import carry_out
+from experiments.thesis import jobs
+from experiments.thesis.graph import PlannedRun
+from runs import spec_of, write_run
 
 EXHAUSTED = jax.errors.JaxRuntimeError(
     "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9876543210 bytes."
@@ -117,10 +121,126 @@ def test_what_the_message_says_is_what_the_run_goes_on_with(tmp_path, monkeypatc
     assert main([*words, "--mapping", "vmap"]) == 1
     message = capsys.readouterr().err
     assert message.startswith("error: a device has no memory left: an update mapped 2 members")
-    (advice,) = [part for part in message.split(". ") if part.startswith("`train` goes on with ")]
-    options = advice.removeprefix("`train` goes on with ").partition(" (")[0].split()
-    assert main([*words, *options]) == 130
+    assert options_of(message) == ["--resume", "--mapping", "chunks", "--mapping-chunk", "1"]
+    assert main([*words, *options_of(message)]) == 130
     assert seen == [("vmap", 1), ("chunks", 1)]
+
+
+def options_of(message):
+    """The options with which a message says that the same command goes on."""
+    return message.partition("the same command goes on with ")[2].partition(" (")[0].split()
+
+
+GRID = ["--preset", "debug", "--seeds", "0", "1", "2", "--results"]
+COMMANDS = {
+    "table": ["table", "3", *GRID],
+    "figure": ["figure", "13", *GRID],
+    "sweep": ["sweep", "--table", "3", *GRID],
+    "work": ["work"],
+    "demo": ["demo", "--preset", "debug", "--source", "zoo:x", "--results"],
+}
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """How runs map their members that are begun; each has four, and no device has memory for more
+    than two at once."""
+    seen = []
+
+    def make_run(spec, directory, *, lock=None, **_):
+        schedule = spec.config.schedule
+        seen.append((schedule.mapping, schedule.mapping_chunk))
+        chosen = {"mapping": schedule.mapping, "mapping_chunk": schedule.mapping_chunk}
+        run = run_that_raises(EXHAUSTED, 4, **chosen)
+        if lock is not None:
+            run.close = lock.release
+        if memory.at_once(run.agent, 4) <= 2:
+            run.train = lambda: "stopped"
+        return run
+
+    monkeypatch.setattr(jobs, "make_run", make_run)
+    monkeypatch.setattr("experiments.runs.run.make_run", make_run)
+    monkeypatch.setattr("experiments.runs.agents.load_source", lambda *_: None)
+    return seen
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_trains_names_options_of_its_own_with_which_it_goes_on(
+    tmp_path, begun, capsys, command
+):
+    words = [*COMMANDS[command], str(tmp_path)]
+    if command == "work":
+        main([*COMMANDS["sweep"], str(tmp_path)])  # plans, and leaves what it cannot train
+        words = ["work", str(tmp_path / "debug")]
+        capsys.readouterr()
+        begun.clear()
+    assert main([*words, "--mapping", "vmap"]) == 1
+    message = capsys.readouterr().err
+    assert "a device has no memory left: an update mapped 4 members at once" in message
+    assert options_of(message) == ["--mapping", "chunks", "--mapping-chunk", "2"]
+    assert "--resume" not in message and "train" not in message
+    assert main([*words, *options_of(message)]) == 130
+    assert begun[0] == ("vmap", 1) and begun[-1] == ("chunks", 2)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_trains_maps_as_many_members_as_a_device_has_memory_for(
+    tmp_path, begun, monkeypatch, command
+):
+    """Also of what was planned with more at once."""
+    words = [*COMMANDS[command], str(tmp_path)]
+    if command == "work":
+        main([*COMMANDS["sweep"], str(tmp_path), "--mapping", "vmap"])
+        words = ["work", str(tmp_path / "debug")]
+        begun.clear()
+    # As on an accelerator.
+    monkeypatch.setattr(memory, "at_once", lambda agent, members: of_settings(agent))
+    monkeypatch.setattr(memory, "room_for", lambda *_: 2)
+    assert main(words) == 130
+    assert begun[0] == ("chunks", 2)
+
+
+def test_a_run_that_was_begun_on_a_larger_device_goes_on_on_a_smaller_one(
+    tmp_path, begun, monkeypatch
+):
+    schedule = dataclasses.replace(DEBUG.schedule, mapping="chunks", mapping_chunk=7)
+    config = dataclasses.replace(DEBUG, schedule=schedule)
+    spec = spec_of("hopper", seeds=tuple(range(8)), config=config)
+    write_run(tmp_path / "run", spec)
+    run = PlannedRun("run", ("a cell",) * 8, spec)
+    monkeypatch.setattr(memory, "at_once", lambda agent, members: of_settings(agent))
+    monkeypatch.setattr(memory, "room_for", lambda *_: 2)
+    assert jobs.train(run, tmp_path) == "stopped"
+    assert jobs.train(run, tmp_path, jobs.Means(mapping="chunks", mapping_chunk=1)) == "stopped"
+    assert begun == [("chunks", 2), ("chunks", 1)]
+
+
+def of_settings(agent):
+    schedule = agent.config.schedule
+    return schedule.mapping_chunk if schedule.mapping == "chunks" else 4
+
+
+def test_from_python_the_message_names_keywords(tmp_path, monkeypatch):
+    seen = []
+
+    def make_run(spec, directory, **_):
+        seen.append((directory, spec.config.schedule.mapping, spec.config.schedule.mapping_chunk))
+        schedule = spec.config.schedule
+        return run_that_raises(
+            EXHAUSTED, 4, mapping=schedule.mapping, mapping_chunk=schedule.mapping_chunk
+        )
+
+    monkeypatch.setattr(api, "make_run", make_run)
+    asked = {"preset": "debug", "seeds": [0, 1, 2, 3]}
+    with pytest.raises(OutOfMemoryError) as caught:
+        api.train("bullet/hopper", mapping="vmap", **asked)
+    given = 'the same call goes on with mapping="chunks", mapping_chunk=2 (half as many'
+    assert given in str(caught.value) and "--" not in str(caught.value)
+    with pytest.raises(OutOfMemoryError):
+        api.train("bullet/hopper", mapping="chunks", mapping_chunk=2, **asked)
+    # Where it is kept does not depend on the machine.
+    assert len({directory for directory, *_ in seen}) == 1
+    assert [how for _, *how in seen] == [["vmap", 1], ["chunks", 2]]
 
 
 def test_train_maps_as_many_members_at_once_as_a_device_has_memory_for(tmp_path, monkeypatch):

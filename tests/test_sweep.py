@@ -129,11 +129,11 @@ def test_two_sweeps_at_once_share_the_work_and_train_nothing_twice(tmp_path, mon
     monkeypatch.setattr(local.time, "sleep", interrupted)
     second = []
 
-    def train(run, root, workers):
+    def train(run, root, means):
         if not second:  # while this run, the first, is in training
             second.append(None)
             second[:] = sweep(tmp_path)
-        return Trainer()(run, root, workers)
+        return Trainer()(run, root, means)
 
     with planned(cells_of(), CONFIG, tmp_path) as runs:
         engine = functools.partial(one_by_one, train=train)
@@ -151,9 +151,9 @@ def test_two_sweeps_at_once_share_the_work_and_train_nothing_twice(tmp_path, mon
 def test_what_a_run_compiled_is_freed_after_it(tmp_path, monkeypatch):
     compiled = jax.jit(lambda x: x + 1)
     monkeypatch.setattr(jobs, "make_run", lambda *_, **__: 1)
-    monkeypatch.setattr(jobs, "carry_out", lambda run: compiled(run) and "finished")
+    monkeypatch.setattr(jobs, "carry_out", lambda run, _: compiled(run) and "finished")
     source, *_ = plan(tmp_path)
-    assert jobs.train(source, tmp_path, None) == "finished"
+    assert jobs.train(source, tmp_path) == "finished"
     assert compiled._cache_size() == 0
 
 

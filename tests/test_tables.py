@@ -11,7 +11,9 @@ import envs
 from dreamer_jax.files import read_json
 from dreamer_jax.logs import read_metrics
 from experiments.cli import reports, thesis
+from experiments.cli.engines import Execution
 from experiments.cli.main import main
+from experiments.cli.selection import Sweep
 from experiments.reports.classification import read_classification
 from experiments.reports.outcomes import read_outcomes
 from experiments.runs.folder import folders, latents_folder
@@ -85,9 +87,9 @@ def test_runs_say_where_their_sources_are_from_the_folder_of_all(root):
 
 def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(made, root, written):
     before = metrics(root)
-    sweep = thesis.Sweep("debug", (0, 1), results=made, config=CONFIG)
+    sweep = Sweep("debug", (0, 1), results=made, config=CONFIG)
     figure = dataclasses.replace(grid.FIGURES["figure-36"], tasks=("InvertedPendulum",))
-    assert thesis._make([TABLE, figure], sweep, thesis.Execution()) == 0
+    assert thesis._make([TABLE, figure], sweep, Execution()) == 0
     assert written == [TABLE, figure]
     assert metrics(root) == before
     outcomes = read_outcomes(root, [*shown(TABLE, (0, 1)), *shown(figure, (0, 1))])
@@ -108,8 +110,8 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(made, written, 
             spec = dataclasses.replace(spec, method=method)
         finish(run, root)
         write_run(root / run.name, spec, seed, keep=True)
-    sweep = thesis.Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)
-    assert thesis._make([META], sweep, thesis.Execution()) == 0
+    sweep = Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)
+    assert thesis._make([META], sweep, Execution()) == 0
     assert len(targets.cells) == 2
     outcomes = read_outcomes(root, shown(META, (0, 1)))
     assert {outcome.state for outcome in outcomes.values()} == {"done"}
@@ -139,9 +141,9 @@ def classified(tmp_path_factory):
 
 def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatch, written):
     monkeypatch.setattr(latent_tables, "gather", None)
-    sweep = thesis.Sweep("debug", results=classified.parent, config=CONFIG)
+    sweep = Sweep("debug", results=classified.parent, config=CONFIG)
     entries = [TABLES[f"table-{number}"] for number in (13, 14, 15)]
-    assert thesis._make(entries, sweep, thesis.Execution()) == 0
+    assert thesis._make(entries, sweep, Execution()) == 0
     for entry in entries:
         found = read_classification(classified, entry)
         assert (found.samples, found.feature_size) == (100, 12)

@@ -163,7 +163,7 @@ def test_a_job_may_wait_for_the_process_that_has_claimed_its_run(tmp_path, monke
 def test_workers_share_what_is_planned_and_train_each_run_once_after_its_needs(tmp_path):
     trained, done = [], []
 
-    def train(run, root, workers):
+    def train(run, root, means):
         trained.append(run.name)
         assert all(name in done for name in run.needs)
         time.sleep(0.05)

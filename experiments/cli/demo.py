@@ -13,7 +13,7 @@ import tyro
 from dreamer_jax import config as configs
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import STOPPED, usage_errors
-from experiments.cli.options import Devices, Simulators
+from experiments.cli.options import AtOnce, Devices, Simulators
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Demo:
     """Settings; debug runs in seconds, from a source of its own sizes."""
     devices: Devices = setting("all", 1, 10_000)
     """Devices to spread the agents over, each agent on one of them."""
+    at_once: tyro.conf.OmitArgPrefixes[AtOnce] = AtOnce()
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
 
 
@@ -48,8 +49,10 @@ def demo(command: Demo) -> int:
     from experiments.reports.outcomes import read_run
     from experiments.runs.agents import load_source
     from experiments.runs.evaluate import load_agents
+    from experiments.runs.memory import in_memory, mapped
     from experiments.runs.run import carry_out, make_run
     from experiments.runs.spec import RunSpec
+    from experiments.runs.ways_out import DEMO
 
     folder = command.results / command.preset / "demo"
     workers, timeout = command.simulators.workers, command.simulators.simulator_timeout
@@ -59,10 +62,16 @@ def demo(command: Demo) -> int:
         spec = RunSpec(
             (command.task,), command.seeds, configs.preset(command.preset), method=method
         )
+        spec = mapped(spec, command.at_once.mapping, command.at_once.mapping_chunk)
         run = make_run(
-            spec, folder, resume=True, workers=workers, timeout=timeout, devices=command.devices
+            in_memory(spec, command.devices),
+            folder,
+            resume=True,
+            workers=workers,
+            timeout=timeout,
+            devices=command.devices,
         )
-    if carry_out(run) == "stopped":
+    if carry_out(run, DEMO) == "stopped":
         print(f"stopped and saved in {folder}: the same command goes on")
         return STOPPED
     print("\nWhat was transferred, leaf by leaf (norms are means over the targets)\n")

@@ -3,6 +3,7 @@
 What takes long to import is imported where it is used, so that bad input is told at once.
 """
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,12 @@ import tyro
 
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import FAILURE, STOPPED, usage_errors
-from experiments.cli.options import Devices, Simulators
+from experiments.cli.options import AtOnce, Devices, Simulators
 
 if TYPE_CHECKING:
     from experiments.thesis.engines import Engine
     from experiments.thesis.graph import Graph
+    from experiments.thesis.jobs import Means
     from experiments.thesis.sweep import Progress
 
 
@@ -58,6 +60,7 @@ class Work:
     """The folder that holds the runs, such as results/cpu."""
     devices: Devices = setting("all", 1, 10_000)
     """Devices to spread members over, each member on one of them."""
+    at_once: tyro.conf.OmitArgPrefixes[AtOnce] = AtOnce()
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     accept_failed: bool = False
     """Transfer from agents whose losses were not finite any more, as they were before."""
@@ -97,27 +100,24 @@ def engine_of(execution: Execution) -> "Engine":
     return one_by_one
 
 
-def engine_options(execution: Execution, runs: "Graph", simulators: Simulators) -> dict[str, Any]:
+def engine_options(execution: Execution, runs: "Graph", means: "Means") -> dict[str, Any]:
     """Keywords of `sweep.carry_out_runs`: the engine, and what runs get of it.
 
     Args:
       execution: the options.
       runs: from `graph.plan_runs`.
-      simulators: options of simulators.
+      means: how runs are trained; with an engine of several machines, those simulate in as many
+        processes as a run has cores, if that is not said.
     """
-    engine, timeout = engine_of(execution), simulators.simulator_timeout
+    engine = engine_of(execution)
     if execution.executor == "local":
-        return {"engine": engine, "workers": simulators.workers, "timeout": timeout}
+        return {"engine": engine, "means": means}
     from experiments.thesis.engines import Resources
     from experiments.thesis.engines.demands import demands
 
     asked = Resources(execution.gpus, execution.cpus, execution.memory, execution.hours)
-    return {
-        "engine": engine,
-        "workers": simulators.workers or execution.cpus,
-        "timeout": timeout,
-        "resources": demands(runs, asked),
-    }
+    means = dataclasses.replace(means, workers=means.workers or execution.cpus)
+    return {"engine": engine, "means": means, "resources": demands(runs, asked)}
 
 
 def chosen_run(runs: "Graph", name: str | None) -> "Graph":
@@ -157,18 +157,23 @@ def work(command: Work) -> int:
             )
     from dreamer_jax.devices import check_devices
     from dreamer_jax.host_memory import keep_freed_memory
+    from experiments.runs.ways_out import WORK
     from experiments.thesis import sweep
+    from experiments.thesis.jobs import Means
 
     with usage_errors():
         check_devices(command.devices)
     keep_freed_memory()
-    progress = sweep.work(
-        command.results,
-        workers=command.simulators.workers,
-        accept_failed=command.accept_failed,
-        timeout=command.simulators.simulator_timeout,
-        devices=command.devices,
+    means = Means(
+        command.simulators.workers,
+        command.accept_failed,
+        command.simulators.simulator_timeout,
+        command.devices,
+        command.at_once.mapping,
+        command.at_once.mapping_chunk,
+        WORK,
     )
+    progress = sweep.work(command.results, means=means)
     if progress.stopped:
         print("stopped and saved: the same command goes on")
     else:

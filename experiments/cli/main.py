@@ -16,7 +16,7 @@ import tyro
 
 from dreamer_jax.output import safe_output
 from dreamer_jax.ranges import check_ranges
-from experiments.cli import demo, engines, reports, runs, sharing, thesis
+from experiments.cli import demo, engines, plan, reports, runs, sharing, thesis
 from experiments.cli.exits import FAILURE, STOPPED, USAGE, UsageError, usage_errors
 from experiments.cli.options import CONSTRUCTORS, Base, read_base
 
@@ -57,7 +57,7 @@ COMMANDS = {
     "figure": _plain(thesis.Figures, thesis.figures, thesis.figure_defaults),
     "sweep": _plain(thesis.Sweeps, thesis.sweep, thesis.sweep_defaults),
     "work": _plain(engines.Work, engines.work),
-    "plan": _plain(thesis.Plan, thesis.plan, thesis.plan_defaults),
+    "plan": _plain(plan.Plan, plan.plan, plan.plan_defaults),
     "seeds": _plain(reports.Seeds, reports.seeds),
     "demo": _plain(demo.Demo, demo.demo),
 }

@@ -45,6 +45,17 @@ class Simulators:
     saved and ended then."""
 
 
+@dataclasses.dataclass(frozen=True)
+class AtOnce:
+    """How many members an update maps at once. It changes no result but by rounding."""
+
+    mapping: Literal["auto", "vmap", "chunks"] = "auto"
+    """How members of a population are mapped in an update; auto: as many at once as a device has
+    memory for, one after the other on a CPU."""
+    mapping_chunk: int = setting(1, 1, 10**6)
+    """Members in a chunk."""
+
+
 class Compared(str):
     """The name of a method that tables may show beside their own."""
 

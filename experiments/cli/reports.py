@@ -12,7 +12,7 @@ import tyro
 from dreamer_jax.ranges import setting
 from experiments.cli.exits import UsageError, usage_errors
 from experiments.cli.options import DEFAULT_PRESET, Compared, Preset
-from experiments.cli.thesis import chosen
+from experiments.cli.selection import chosen
 from experiments.thesis import grid
 from experiments.thesis.grid import Backend, Figure, LatentTable, ReturnsTable, Table
 

@@ -132,6 +132,8 @@ class Evaluate:
     """Episodes per agent and task."""
     video: bool = False
     """Write videos of an episode and of an open-loop prediction into the folder."""
+    devices: Devices = setting("all", 1, 10_000)
+    """Devices to spread the agents over, each agent on one of them."""
     simulators: tyro.conf.OmitArgPrefixes[Simulators] = Simulators()
     trust: bool = False
     """Import the modules that the tasks of a folder made by others name, and so run their code."""
@@ -218,10 +220,8 @@ def train(command: Train) -> int:
 
     keep_freed_memory()
     with usage_errors():
-        if spec.config.schedule.mapping == "auto":
-            spec = in_memory(spec, run.devices)
         begun = make_run(
-            spec,
+            in_memory(spec, run.devices),
             run.out,
             resume=run.resume or run.from_checkpoint is not None,
             workers=run.simulators.workers,
@@ -251,8 +251,10 @@ def verify(command: Verify) -> int:
 def evaluate(command: Evaluate) -> int:
     """Plays episodes and prints their returns."""
     with usage_errors():
+        from dreamer_jax.devices import check_devices
         from experiments.runs.trust import check_trust
 
+        check_devices(command.devices)
         check_trust([command.directory], command.trust)
         lock = FolderLock(command.directory, ".evaluation.lock")
     with lock:
@@ -276,6 +278,7 @@ def _evaluate(command: Evaluate) -> int:
             video=command.video,
             workers=command.simulators.workers,
             timeout=command.simulators.simulator_timeout,
+            devices=command.devices,
             report=report,
         )
     groups: dict[tuple, list] = {}

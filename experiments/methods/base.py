@@ -103,12 +103,14 @@ class Knowledge(NamedTuple):
       own: for each target, its place on the leading axis of the source's leaves; None where all
         targets read the same.
       parameters: values of the plan, one for each target.
+      stacked: which of the source's trees have leaves for each target, on a leading axis.
     """
 
     plan: "transfer.Plan"
     source: Any
     own: Sequence[int] | None = None
     parameters: Mapping[str, Sequence[float]] = {}
+    stacked: tuple[str, ...] = ()
 
 
 class Cell(Protocol):

@@ -191,7 +191,8 @@ class MetaModel(UniversalAutoencoder):
         if self.switching:
             classifier = self.known_tasks(sources.stored, sample)
             stored["reward"]["classifier"] = transfer.replicate(classifier, size=len(targets))
-        return Knowledge(self.plan(), {"autoencoder": sources.agents[0].params, "stored": stored})
+        trees = {"autoencoder": sources.agents[0].params, "stored": stored}
+        return Knowledge(self.plan(), trees, stacked=("stored",))
 
     def stored_models(
         self, sources: Sequence[Any], counts: Sequence[int], *, action_size: int

@@ -13,10 +13,13 @@ import numpy as np
 
 import envs
 from dreamer_jax.agent import Agent
+from dreamer_jax.devices import Choice, Placement, on_one_device, place
+from dreamer_jax.learning import AgentState
+from dreamer_jax.population import Population
 from dreamer_jax.progress import Report, unreported
 from dreamer_jax.randomness import EVALUATION_PHASES, prediction_key
 from dreamer_jax.records import Records
-from dreamer_jax.rollout import Episode, collect, episodes
+from dreamer_jax.rollout import Episode, episodes
 from dreamer_jax.video import tile, write_video
 from dreamer_jax.waiting import to_host
 from experiments.runs.agents import load_params, make_agent, make_env
@@ -58,6 +61,7 @@ def evaluate(
     video: bool = False,
     workers: int | None = None,
     timeout: float = envs.SIMULATOR_TIMEOUT,
+    devices: Choice = "all",
     report: Report = unreported,
 ) -> list[dict[str, Any]]:
     """Plays episodes with every member of a run: the mode, without noise, up to the first fall.
@@ -68,18 +72,24 @@ def evaluate(
       video: whether to write videos/evaluate_TASK.mp4 and videos/prediction_TASK.mp4.
       workers: simulator processes; by default one per core.
       timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many to spread the members over, each member on one of them.
       report: called after each episode, with its mean return; it counts episodes.
 
     Returns:
       One row per member, task and episode: member, seed, label, task, episode, return, length,
       fell.
+
+    Raises:
+      ValueError: there are not so many devices.
     """
     directory, spec, params = agents
-    agent, env = make_agent(spec), make_env(spec, workers, timeout)
+    placement = place(len(spec.members), devices)
+    agent, env = make_agent(spec), make_env(spec, workers, timeout, shards=placement.count)
     rows = []
     try:
+        player = _Player(agent, env, agents, placement)
         for number in range(count):
-            records = _played(agent, env, agents, number)
+            records = player.play(number)
             new = _rows(spec, records, number)
             rows += new
             report(number + 1, count, f"return {np.mean([row['return'] for row in new]):.0f}")
@@ -110,28 +120,32 @@ def play(
     """
     env = make_env(agents.spec, workers, timeout)
     try:
-        return _played(make_agent(agents.spec), env, agents, number)
+        placement = on_one_device(len(agents.spec.members))
+        return _Player(make_agent(agents.spec), env, agents, placement).play(number)
     finally:
         env.close()
 
 
-def _played(agent: Agent, env, agents: Agents, number: int) -> Records:
-    spec = agents.spec
-    seeds = jnp.array([member.seed for member in spec.members], jnp.int32)
-    records = collect(
-        agent,
-        env,
-        agents.params,
-        seeds,
-        jnp.zeros_like(seeds),
-        jnp.int32(EVALUATION_PHASES[number]),
-        tasks=len(spec.tasks),
-        ticks=spec.config.schedule.phase_ticks,
-        mode="evaluate",
-    )
-    records = to_host(records)
-    env.check()
-    return records
+class _Player:
+    """Members on their devices, and what they play."""
+
+    def __init__(self, agent: Agent, env, agents: Agents, placement: Placement):
+        spec, self._env, self._placement = agents.spec, env, placement
+        seeds = [member.seed for member in spec.members]
+        self._population = Population(agent, env, len(spec.tasks), seeds, placement)
+        # Of an agent that is done nothing but its parameters is played.
+        count = len(seeds)
+        state = AgentState(
+            agents.params, {}, jnp.zeros(count, jnp.int32), jnp.array(seeds), jnp.ones(count, bool)
+        )
+        self._state = self._population.put(state)
+
+    def play(self, number: int) -> Records:
+        """One phase of every member on every task, NumPy leaves [P, K, T, ...]."""
+        phase = int(EVALUATION_PHASES[number])
+        records = to_host(self._population.collect(self._state, phase, "evaluate"))
+        self._env.check()
+        return self._placement.own(records)
 
 
 def _rows(spec: RunSpec, records: Records, number: int) -> list[dict[str, Any]]:

@@ -14,10 +14,11 @@ import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.device_round import on_device, replay_bytes
 from dreamer_jax.devices import Choice, place
-from dreamer_jax.population import batch_shapes
+from dreamer_jax.population import batch_shapes, update_member
 from dreamer_jax.training import Run
 from experiments.runs.agents import make_agent
-from experiments.runs.spec import RunSpec
+from experiments.runs.spec import Mapped, RunSpec
+from experiments.runs.ways_out import WaysOut
 
 MEMORY_SHARE = 0.8
 """Share of a device's memory that is counted on."""
@@ -33,7 +34,8 @@ def traced_update(agent: Agent):
     learning = agent.config.learning
     batch = batch_shapes(agent, learning.batch_size, learning.sequence_length)
     state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
-    return jax.jit(agent.update).trace(state, batch), state, batch
+    # What maps it over members shares the trace.
+    return update_member.trace(agent, state, batch), state, batch
 
 
 @functools.cache
@@ -100,14 +102,19 @@ def room_for(agent: Agent, tasks: int, members: int, has_host: bool) -> int | No
         return None
     update_bytes = max(1, compiled_update(agent).memory_analysis().temp_size_in_bytes)
     taken = bytes_of(agent, tasks, members, 0, update_bytes)
-    if on_device(agent, has_host, tasks, members)[0]:
+    if on_device(agent, has_host, tasks, members).device:
         taken += replay_bytes(agent, tasks, members)
     return max(1, int(MEMORY_SHARE * limit - taken) // update_bytes)
 
 
 def in_memory(spec: RunSpec, devices: Choice = "all") -> RunSpec:
     """The spec with its updates in chunks, where a device's memory is short for all of its members
-    at once (and for their replay, if that lies there too)."""
+    at once (and for their replay, if that lies there too).
+
+    A spec that says how members are mapped is left as it is.
+    """
+    if spec.config.schedule.mapping != "auto":
+        return spec
     agent, each = make_agent(spec), place(len(spec.members), devices).each
     if at_once(agent, each) == 1:
         return spec
@@ -115,7 +122,12 @@ def in_memory(spec: RunSpec, devices: Choice = "all") -> RunSpec:
     fits = room_for(agent, len(spec.tasks), each, has_host)
     if fits is None or fits >= at_once(agent, each):
         return spec
-    schedule = dataclasses.replace(spec.config.schedule, mapping="chunks", mapping_chunk=fits)
+    return mapped(spec, "chunks", fits)
+
+
+def mapped(spec: RunSpec, mapping: Mapped, chunk: int) -> RunSpec:
+    """The spec with its members mapped as that says, see `dreamer_jax.population.map_members`."""
+    schedule = dataclasses.replace(spec.config.schedule, mapping=mapping, mapping_chunk=chunk)
     return dataclasses.replace(spec, config=dataclasses.replace(spec.config, schedule=schedule))
 
 
@@ -127,23 +139,25 @@ def is_exhausted(error: BaseException | None) -> bool:
     return ours or is_exhausted(error.__cause__)
 
 
-def out_of_memory(run: Run) -> OutOfMemoryError:
-    """What to say of a run whose device had no memory left: what it mapped, and what may fit."""
+def out_of_memory(run: Run, ways: WaysOut) -> OutOfMemoryError:
+    """What to say of a run whose device had no memory left: what it mapped, and what may fit.
+
+    Args:
+      run: the run.
+      ways: what to do about it, in the words of what was called.
+    """
     agent, each, tasks = run.agent, run.placement.each, len(run.tasks)
-    mapped = at_once(agent, each)
+    before = at_once(agent, each)
     told = (
-        f"a device has no memory left: an update mapped {mapped} "
-        f"member{'s' if mapped > 1 else ''} at once, of {each} on each device"
+        f"a device has no memory left: an update mapped {before} "
+        f"member{'s' if before > 1 else ''} at once, of {each} on each device"
     )
-    others = "fewer agents to a run, smaller batches (--batch-size), or --replay files if it is not"
-    if mapped == 1:
-        return OutOfMemoryError(f"{told}: what is left is {others}")
-    room, half = room_for(agent, tasks, each, run.env.has_host), mapped // 2
-    if room is not None and room < mapped:
+    if before == 1:
+        return OutOfMemoryError(f"{told}: what is left is {ways.otherwise}")
+    room, half = room_for(agent, tasks, each, run.env.has_host), before // 2
+    if room is not None and room < before:
         chunk, why = room, "by the compiler's count that fits"
     else:
         chunk, why = half, "half as many; fewer if that does not fit either"
-    return OutOfMemoryError(
-        f"{told}. `train` goes on with --resume --mapping chunks --mapping-chunk {chunk} ({why}). "
-        f"Else: {others}"
-    )
+    goes_on = ways.with_chunks.format(chunk=chunk)
+    return OutOfMemoryError(f"{told}; {goes_on} ({why}). Else: {ways.otherwise}")

@@ -28,6 +28,7 @@ from experiments.runs.agents import make_agent, make_env
 from experiments.runs.memory import is_exhausted, out_of_memory
 from experiments.runs.spec import RunSpec, read_spec
 from experiments.runs.start import load_sources, transferred_members
+from experiments.runs.ways_out import TRAIN, WaysOut
 
 
 def _versions() -> dict[str, str]:
@@ -42,7 +43,7 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _revision() -> str:
+def revision() -> str:
     """The commit of the source tree, marked if it was changed since; else the package's version."""
     tree = Path(__file__).parents[2]
     if (tree / ".git").exists():
@@ -105,7 +106,9 @@ def make_run(
         state, report = None, None
         if spec.method.needs and Checkpointer(directory / "checkpoints").latest() is None:
             sources = load_sources(spec, base, accept_failed=accept_failed)
-            state, report = transferred_members(spec, sources, workers=workers, timeout=timeout)
+            state, report = transferred_members(
+                spec, sources, workers=workers, timeout=timeout, placement=placement
+            )
         agent = make_agent(spec)
         env = make_env(spec, workers=workers, timeout=timeout, shards=placement.count)
         # What cannot be had is refused before the folder is made.
@@ -117,7 +120,7 @@ def make_run(
         # Written last: what has a header can be resumed.
         if not (directory / "run.json").exists():
             named = {"cells": list(cells)} if cells else {}
-            made_with = {"versions": _versions(), "revision": _revision()}
+            made_with = {"versions": _versions(), "revision": revision()}
             content = {"spec": spec.to_dict(), **named, **made_with}
             write_sealed_json(directory / "run.json", content)
         return Run(
@@ -184,8 +187,12 @@ def _plain(value):
     return np.asarray(value).tolist()
 
 
-def carry_out(run: Run) -> Literal["finished", "stopped"]:
+def carry_out(run: Run, ways: WaysOut = TRAIN) -> Literal["finished", "stopped"]:
     """Trains to the end or to Ctrl-C, and closes the run and its simulators.
+
+    Args:
+      run: the run.
+      ways: what to do about a device without memory, in the words of what was called.
 
     Raises:
       OutOfMemoryError: a device has no memory left; names what may fit.
@@ -196,7 +203,7 @@ def carry_out(run: Run) -> Literal["finished", "stopped"]:
     except (jax.errors.JaxRuntimeError, MemoryError) as error:
         if not is_exhausted(error):
             raise
-        raise out_of_memory(run) from error
+        raise out_of_memory(run, ways) from error
     finally:
         run.close()
         run.env.close()

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import envs
 from dreamer_jax import config as configs
@@ -18,6 +18,9 @@ from experiments.methods.scratch import Scratch
 
 if TYPE_CHECKING:
     from dreamer_jax.population import Member
+
+Mapped = Literal["auto", "vmap", "chunks"]
+"""The setting `mapping`."""
 
 OF_THE_MACHINE = ("schedule.mapping", "schedule.mapping_chunk", "schedule.replay_threads")
 """How members are mapped and batches are put together depends on the machine, and changes no result

@@ -3,6 +3,7 @@
 Axis letters: P population member.
 """
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 
 import envs
 import transfer
+from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.learning import AgentState
 from experiments.methods import Sources
 from experiments.runs.agents import check_source, load_source, make_agent
@@ -47,14 +49,18 @@ def transferred_members(
     *,
     workers: int | None = None,
     timeout: float = envs.SIMULATOR_TIMEOUT,
+    placement: Placement | None = None,
 ) -> tuple[AgentState, transfer.Report]:
     """Fresh agents for all members, the targets among them after the run's method.
+
+    Each device makes its own members; of several devices all are then gathered on the host.
 
     Args:
       spec: of the run.
       sources: from `load_sources`.
       workers: simulator processes for latent states that a method asks for.
       timeout: seconds after which a simulator that does not answer is given up.
+      placement: where members lie; by default all on one device.
 
     Returns:
       The state, leaves [P, ...], and the report of what happened to each leaf.
@@ -62,28 +68,47 @@ def transferred_members(
     Raises:
       ValueError: the sources do not fit what the method reads.
     """
-    agent, method = make_agent(spec), spec.method
+    agent, method, members = make_agent(spec), spec.method, len(spec.members)
+    placement = placement or on_one_device(members)
     sample = functools.partial(own_latents, workers=workers, timeout=timeout)
     given = method.knowledge(agent, spec.seeds, sources, sample)
-    # Members from scratch come last.
     count = len(method.targets(spec.seeds))
+
+    def for_all(values):
+        """Members from scratch come last. They are handed what the first target is, in vain."""
+        return jnp.concatenate([values, jnp.repeat(values[:1], members - count, axis=0)])
+
     parameters = {name: jnp.array(x, jnp.float32) for name, x in given.parameters.items()}
     own = None if given.own is None else jnp.array(given.own)
+    theirs = {name: given.source[name] for name in given.stacked}
+    shared = given.source
+    if theirs:
+        shared = {name: tree for name, tree in shared.items() if name not in theirs}
 
-    @jax.jit
-    def start(seeds, knowledge, own, parameters):
+    def chosen(first, one, other):
+        return jax.tree.map(lambda x, y: jnp.where(first, x, y), one, other)
+
+    def start(seeds, is_target, own, theirs, parameters, shared):
         fresh = jax.vmap(agent.init)(seeds).params
+        knowledge = {**shared, **theirs} if theirs else shared
         if own is not None:
             knowledge = jax.tree.map(lambda x: x[own], knowledge)
         targets, report = transfer.apply(
-            given.plan,
-            jax.tree.map(lambda x: x[:count], fresh),
-            knowledge,
-            population=True,
-            **parameters,
+            given.plan, fresh, knowledge, population=True, **parameters
         )
-        join = lambda new, old: jnp.concatenate([new, old[count:]])  # noqa: E731
-        return jax.vmap(agent.start)(jax.tree.map(join, targets, fresh), seeds), report
+        if count < members:
+            targets = jax.vmap(chosen)(is_target, targets, fresh)
+        return jax.vmap(agent.start)(targets, seeds), report
 
     seeds = jnp.array([member.seed for member in spec.members], jnp.int32)
-    return start(seeds, given.source, own, parameters)
+    of_members = (
+        seeds,
+        jnp.arange(members) < count,
+        *jax.tree.map(for_all, (own, theirs, parameters)),
+    )
+    made = jax.jit(placement.over_devices(start, (0, 0, 0, 0, 0, None)))
+    state, report = placement.own(made(*placement.spread(of_members), shared))
+    # It is of the targets alone.
+    report = jax.tree.map(lambda x: x[:count], report)
+    rows = tuple(row._replace(shape=(count, *row.shape[1:])) for row in report.rows)
+    return state, dataclasses.replace(report, rows=rows)

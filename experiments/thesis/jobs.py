@@ -7,7 +7,6 @@ What fails is named. A folder that is damaged is set aside: renamed, never delet
 """
 
 import contextlib
-import functools
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -27,8 +26,10 @@ from dreamer_jax.record_checks import RecordsError
 from dreamer_jax.training import NonFiniteError
 from envs import SimulatorError
 from experiments.runs.folder import CELLS, begun, set_aside
-from experiments.runs.memory import OutOfMemoryError, in_memory
+from experiments.runs.memory import OutOfMemoryError, in_memory, mapped
 from experiments.runs.run import carry_out, make_run
+from experiments.runs.spec import Mapped
+from experiments.runs.ways_out import GRID, WaysOut
 from experiments.thesis.graph import DamagedRun, PlannedRun, inspect_run
 from experiments.thesis.reservations import at_work, claim, forget, reserved
 from experiments.thesis.speeds import cache_folder
@@ -36,8 +37,36 @@ from experiments.thesis.speeds import cache_folder
 POLL_SECONDS = 5.0
 """How often whoever waits for others looks whether they are done."""
 
-Train = Callable[[PlannedRun, Path, int | None], Literal["finished", "stopped"]]
 Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Means:
+    """How whoever claims a run trains it; it changes no result but by rounding.
+
+    Attributes:
+      workers: simulator processes; by default one per core.
+      accept_failed: take sources whose losses were not finite any more, as they were before.
+      timeout: seconds after which a simulator that does not answer is given up.
+      devices: how many, of those there, to spread members over.
+      mapping, mapping_chunk: how they are mapped there; "auto" asks the device's memory, whatever
+        was right where the run was begun.
+      ways: what to do about a device without memory, in the words of what was called.
+    """
+
+    workers: int | None = None
+    accept_failed: bool = False
+    timeout: float = envs.SIMULATOR_TIMEOUT
+    devices: Choice = "all"
+    mapping: Mapped = "auto"
+    mapping_chunk: int = 1
+    ways: WaysOut = GRID
+
+
+PLAIN = Means()
+"""As whoever does not say how has it."""
+
+Train = Callable[[PlannedRun, Path, Means], Literal["finished", "stopped"]]
 
 
 @dataclass(frozen=True)
@@ -47,18 +76,12 @@ class Job:
     Attributes:
       root: the folder of all results.
       name: of the run.
-      workers: simulator processes; by default one per core.
-      accept_failed: take sources whose losses were not finite any more, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many to spread its members over.
+      means: how.
     """
 
     root: Path
     name: str
-    workers: int | None = None
-    accept_failed: bool = False
-    timeout: float = envs.SIMULATOR_TIMEOUT
-    devices: Choice = "all"
+    means: Means = PLAIN
 
 
 @dataclass(frozen=True)
@@ -85,50 +108,39 @@ def failed_but_kept(name: str, why: str) -> Ending:
     return Ending(name, "failed", f"{why} (it is kept as it is; the same command goes on)")
 
 
-def train(
-    run: PlannedRun,
-    root: Path,
-    workers: int | None,
-    *,
-    accept_failed: bool = False,
-    timeout: float = envs.SIMULATOR_TIMEOUT,
-    devices: Choice = "all",
-) -> Literal["finished", "stopped"]:
+def train(run: PlannedRun, root: Path, means: Means = PLAIN) -> Literal["finished", "stopped"]:
     """Begins a run or goes on with it, until it is done or stopped.
 
     Args:
       run: which one.
       root: the folder of all results.
-      workers: simulator processes; by default one per core.
-      accept_failed: transfer from agents that failed, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many to spread its members over.
+      means: how.
 
     Raises:
       ValueError, CorruptCheckpointError: its folder is damaged, or a source does not fit.
+      OutOfMemoryError: a device has no memory left.
       SimulatorError, NonFiniteError: see `dreamer_jax.training.Run.train`.
     """
-    folder, spec = root / run.name, run.spec
+    folder = root / run.name
     lock = FolderLock(folder)
     if not begun(folder):
         # Of a run that was stopped before anything was kept, perhaps one of other cells.
         (folder / "run.json").unlink(missing_ok=True)
         write_json_atomically(folder / CELLS, list(run.cells))
-        spec = in_memory(spec, devices)
     try:
         begins = make_run(
-            spec,
+            in_memory(mapped(run.spec, means.mapping, means.mapping_chunk), means.devices),
             folder,
             resume=True,
-            workers=workers,
+            workers=means.workers,
             base=root,
-            accept_failed=accept_failed,
-            timeout=timeout,
-            devices=devices,
+            accept_failed=means.accept_failed,
+            timeout=means.timeout,
+            devices=means.devices,
             lock=lock,
             cells=run.cells,
         )
-        return carry_out(begins)
+        return carry_out(begins, means.ways)
     finally:
         # The programs of its simulators serve no other run, and take up to 100 MiB a task.
         jax.clear_caches()
@@ -232,30 +244,21 @@ def _perform(job: Job, train: Train | None, begins: Callable[[PlannedRun], None]
         return Ending(name, "skipped", f"it needs {', '.join(lacking)}", damaged)
     if train is None:
         try:
-            check_devices(job.devices)
+            check_devices(job.means.devices)
         except ValueError as error:
             return Ending(name, "failed", str(error))
-        train = functools.partial(
-            _train,
-            accept_failed=job.accept_failed,
-            timeout=job.timeout,
-            devices=job.devices,
-        )
+        train = _train
     begins(run)
     try:
-        kind = train(run, root, job.workers)
+        kind = train(run, root, job.means)
     except FolderInUseError:
         raise
     except (ValueError, CorruptCheckpointError) as error:
         kept = begun(root / name)
         return Ending(name, "failed", _aside(root, name, str(error)) if kept else str(error))
-    except (
-        SimulatorError,
-        NonFiniteError,
-        RecordsError,
-        OutOfMemoryError,
-        jax.errors.JaxRuntimeError,
-    ) as error:
+    except OutOfMemoryError as error:  # which says how it goes on
+        return Ending(name, "failed", f"{error} (it is kept as it is)")
+    except (SimulatorError, NonFiniteError, RecordsError, jax.errors.JaxRuntimeError) as error:
         return failed_but_kept(name, str(error))
     if kind == "finished":
         forget(root, name)

@@ -16,7 +16,9 @@ import numpy as np
 import envs
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import Config
+from dreamer_jax.learning import AgentState
 from dreamer_jax.progress import Report, unreported
+from dreamer_jax.records import Records
 from envs.pool import available_cores
 from experiments.runs.agents import make_agent
 from experiments.runs.memory import traced_update
@@ -63,8 +65,8 @@ class Speed:
     scaled: float = 1.0
 
 
-def _made_up(agent: Agent):
-    """A state and a batch of made-up numbers for one member's update."""
+def made_up(agent: Agent) -> tuple[AgentState, Records]:
+    """A state and a batch of made-up numbers for one member's update; nothing is compiled."""
     _, state, batch = traced_update(agent)
     random = np.random.default_rng(0)
 
@@ -88,7 +90,7 @@ def sample_of(agent: Agent) -> tuple[Agent, float]:
       times the arithmetic of its update the given agent's is. The agent itself and 1, where its
       update is small.
     """
-    whole = _operations(agent)
+    whole = operations(agent)
     if whole <= SAMPLE_OPERATIONS:
         return agent, 1.0
     learning = agent.config.learning
@@ -101,11 +103,11 @@ def sample_of(agent: Agent) -> tuple[Agent, float]:
     )
     config = dataclasses.replace(agent.config, learning=learning)
     part = dataclasses.replace(agent, config=config)
-    return part, whole / _operations(part)
+    return part, whole / operations(part)
 
 
-def _operations(agent: Agent) -> float:
-    """Of one member's update."""
+def operations(agent: Agent) -> float:
+    """Arithmetic operations of one member's update."""
     return flops.of_jaxpr(traced_update(agent)[0].jaxpr.jaxpr)
 
 
@@ -160,7 +162,7 @@ def measure(
             ticks[task] = _tick_seconds(task, agent.config, timeout)
         report(things, things, "an update and a policy")
         update, update_compile_seconds = compiling.result()
-    state, batch = _made_up(part)
+    state, batch = made_up(part)
     started = time.perf_counter()
     policy_seconds = _policy_seconds(part, state.params)
     compile_seconds = update_compile_seconds + time.perf_counter() - started

@@ -5,13 +5,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import envs
-from dreamer_jax.devices import Choice
 from experiments.runs.folder import folders
 from experiments.thesis.engines import Engine, Resources, Task
 from experiments.thesis.engines.local import in_turn, one_by_one
 from experiments.thesis.graph import DamagedRun, Graph, PlannedRun, due, inspect_run
-from experiments.thesis.jobs import POLL_SECONDS, Ending, Job, Say, Train, set_aside_damaged
+from experiments.thesis.jobs import (
+    PLAIN,
+    POLL_SECONDS,
+    Ending,
+    Job,
+    Means,
+    Say,
+    Train,
+    set_aside_damaged,
+)
 from experiments.thesis.reservations import at_work, reservations
 
 
@@ -62,10 +69,7 @@ def carry_out_runs(
     root: str | Path,
     *,
     engine: Engine = one_by_one,
-    workers: int | None = None,
-    accept_failed: bool = False,
-    timeout: float = envs.SIMULATOR_TIMEOUT,
-    devices: Choice = "all",
+    means: Means = PLAIN,
     resources: Callable[[PlannedRun], Resources] = lambda run: Resources(),
     say: Say = print,
 ) -> Progress:
@@ -75,10 +79,7 @@ def carry_out_runs(
       runs: from `reservations.planned`, whose context lasts.
       root: the folder of all results.
       engine: where they are trained; by default here, in the order given.
-      workers: simulator processes; by default one per core.
-      accept_failed: take sources whose losses were not finite any more, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many, of those that a run is given, to spread its members over.
+      means: how each is trained there.
       resources: what a run gets.
       say: where messages go.
     """
@@ -91,7 +92,7 @@ def carry_out_runs(
     names = {run.name for run in left}
     tasks = [
         Task(
-            Job(root, run.name, workers, accept_failed, timeout, devices),
+            Job(root, run.name, means),
             run,
             tuple(name for name in run.needs if name in names),
             resources(run),
@@ -107,10 +108,7 @@ def carry_out_runs(
 def work(
     root: str | Path,
     *,
-    workers: int | None = None,
-    accept_failed: bool = False,
-    timeout: float = envs.SIMULATOR_TIMEOUT,
-    devices: Choice = "all",
+    means: Means = PLAIN,
     train: Train | None = None,
     say: Say = print,
     poll: float = POLL_SECONDS,
@@ -120,10 +118,7 @@ def work(
 
     Args:
       root: the folder of all results.
-      workers: simulator processes; by default one per core.
-      accept_failed: take sources whose losses were not finite any more, as they were before.
-      timeout: seconds after which a simulator that does not answer is given up.
-      devices: how many, of those that a run is given, to spread its members over.
+      means: how each is trained.
       train: what trains one run.
       say: where messages go.
       poll: seconds between looks at what others do.
@@ -136,7 +131,7 @@ def work(
         names = {folder for folder, _ in folders(root).values()}
         runs = {folder.name: inspect_run(folder) for folder in sorted(names)}
         return [
-            Task(Job(root, run.name, workers, accept_failed, timeout, devices), run, run.needs)
+            Task(Job(root, run.name, means), run, run.needs)
             for run in due(list({**planned, **runs}.values()))
         ]
 

@@ -11,6 +11,11 @@ stored as float32. The same update in float32 can be timed on random data, besid
 
     python tests/golden/pytorch_reference.py time depth=8 deter=100 stoch=20 units=200 B=16 L=20
 
+and on a card, with the products of matrices in TensorFloat-32 as JAX makes them there, or (tf32=0)
+in whole float32:
+
+    python tests/golden/pytorch_reference.py time device=cuda
+
 Axis letters: B batch, L sequence length, H imagination horizon, N imagination starts, A action.
 Parameters are a flat dict, named and laid out as the project's: kernels [inputs, outputs], those of
 convolutions [k, k, inputs, outputs].
@@ -461,7 +466,7 @@ def trace(case):
 
 
 SIZES = {"depth": 32, "deter": 200, "stoch": 30, "units": 400, "B": 50, "L": 50, "H": 15, "A": 6}
-DEFAULTS = SIZES | {"image": 64, "n": 5}
+DEFAULTS = SIZES | {"image": 64, "n": 5, "device": "cpu", "tf32": 1}
 
 
 def timed(words):
@@ -471,7 +476,12 @@ def timed(words):
         name, _, value = word.partition("=")
         if name not in a:
             sys.exit(f"unknown argument {name!r}: choose from {', '.join(a)}")
-        a[name] = int(value)
+        a[name] = type(a[name])(value)
+    device = torch.device(a["device"])
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            sys.exit(f"error: this PyTorch ({torch.__version__}) finds no CUDA device")
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = bool(a["tf32"])
     network = NETWORK | {
         "image_size": a["image"],
         "encoder_depth": a["depth"],
@@ -488,23 +498,29 @@ def timed(words):
     }
     case = {"network": network, "learning": learning}
     random = np.random.default_rng(0)
-    p = tensors(stored(draw_parameters(random, network, a["A"])), torch.float32)
+    drawn = draw_parameters(random, network, a["A"]), draw_batch(random, case, a["A"])
+    p, batch = (
+        {name: x.to(device) for name, x in tensors(stored(tree), torch.float32).items()}
+        for tree in drawn
+    )
     moments = {name: (torch.zeros_like(x), torch.zeros_like(x)) for name, x in p.items()}
-    batch = tensors(stored(draw_batch(random, case, a["A"])), torch.float32)
     seconds = []
     for i in range(a["n"] + 1):
         started = time.perf_counter()
         size = {"posterior": (a["L"], a["B"], a["stoch"])}
         size |= {"prior": (a["H"], a["B"] * a["L"], a["stoch"])}
         size |= {"action": (a["H"], a["B"] * a["L"], a["A"])}
-        noise = {name: torch.randn(shape) for name, shape in size.items()}
+        noise = {name: torch.randn(shape, device=device) for name, shape in size.items()}
         p, moments, _, _ = update(p, moments, case, batch, noise, i)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
         seconds.append(time.perf_counter() - started)
     # The first one allocates.
     median = statistics.median(seconds[1:])
     return {
         "benchmark": "pytorch",
         "torch": torch.__version__,
+        "on": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
         "s_per_update": round(median, 5),
         **a,
     }
