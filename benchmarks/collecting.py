@@ -80,6 +80,8 @@ def seconds_of_a_round(a: dict, collect: str, directory: Path) -> float:
     finally:
         run.close()
         run.env.close()
+    if len(written) < 1 + WARM + a["rounds"]:
+        sys.exit("error: the run was stopped before its last round")
     return (written[-1] - written[-1 - a["rounds"]]) / a["rounds"]
 
 
