@@ -244,11 +244,19 @@ def test_memory_of_chunks_is_that_of_one_chunk(tmp_path):
     assert memory(mapping="vmap") == chunks[-1]
 
 
+def from_files(run):
+    """The run with nothing of its replay on an accelerator."""
+    config = run.spec.config
+    schedule = dataclasses.replace(config.schedule, replay="files")
+    spec = dataclasses.replace(run.spec, config=dataclasses.replace(config, schedule=schedule))
+    return dataclasses.replace(run, spec=spec)
+
+
 @pytest.mark.parametrize(("fitting", "chunk"), [(0.5, 1), (3.5, 3), (5.9, 5), (6.1, None)])
 def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for(
     tmp_path, monkeypatch, fitting, chunk
 ):
-    _, targets, *_ = plan(tmp_path)
+    targets = from_files(plan(tmp_path)[1])
     one = SimpleNamespace(temp_size_in_bytes=10**6)
     beside = estimate.estimate(targets, dataclasses.replace(SPEED, update_bytes=0)).memory
     limit = (beside + fitting * 10**6) / memory.MEMORY_SHARE
@@ -264,7 +272,7 @@ def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for
 
 
 def test_several_accelerators_work_at_once_and_each_has_memory_for_its_own(tmp_path, monkeypatch):
-    _, targets, *_ = plan(tmp_path)  # of 6 agents
+    targets = from_files(plan(tmp_path)[1])  # of 6 agents
     one = SimpleNamespace(temp_size_in_bytes=10**6)
     fixed = dataclasses.replace(SPEED, update_bytes=0, tick_seconds=dict.fromkeys(TASKS, 0.0))
     alone = estimate.estimate(targets, fixed)
