@@ -52,6 +52,16 @@ def of_device(monkeypatch, agent, members, fitting):
     monkeypatch.setattr(memory, "compiled_update", lambda _: one)
 
 
+def test_agents_kept_from_before_a_round_are_counted():
+    def bytes_with(collect):
+        schedule = dataclasses.replace(DEBUG.schedule, collect=collect)
+        agent = Agent(dataclasses.replace(DEBUG, schedule=schedule), 2)
+        return memory.bytes_of(agent, 1, 5, 0, 0)
+
+    kept = bytes_with("beside") - bytes_with("before")
+    assert kept == 5 * memory.member_bytes(Agent(DEBUG, 2))
+
+
 @pytest.mark.parametrize(
     ("mapping", "mapped", "chunk"),
     [

@@ -60,7 +60,8 @@ def record_bytes(agent: Agent) -> int:
 
 
 def bytes_of(agent: Agent, tasks: int, members: int, at_once: int, update_bytes: int) -> int:
-    """Bytes of some members: states, two batches, one phase of records twice, and their updates.
+    """Bytes of some members: states (twice, where those from before a round are kept beside it),
+    two batches, one phase of records twice, and their updates.
 
     Args:
       agent: theirs.
@@ -72,7 +73,8 @@ def bytes_of(agent: Agent, tasks: int, members: int, at_once: int, update_bytes:
     learning, schedule = agent.config.learning, agent.config.schedule
     records = learning.batch_size * learning.sequence_length
     records += (schedule.phase_ticks + 1) * tasks
-    each = member_bytes(agent) + 2 * records * record_bytes(agent)
+    states = 2 if schedule.collect == "beside" else 1
+    each = states * member_bytes(agent) + 2 * records * record_bytes(agent)
     return members * each + at_once * update_bytes
 
 
