@@ -4,6 +4,7 @@ Axis letters: P population member, B batch, L sequence length, A action. Everyth
 for one member and maps over P with `jax.vmap` or `map_members`.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from dreamer_jax import learning, networks, randomness, rssm
+from dreamer_jax.config import ScheduleConfig
 from dreamer_jax.freezing import Params
 from dreamer_jax.learning import AgentState, Metrics
 from dreamer_jax.model import Model, multiplies
@@ -45,6 +47,15 @@ def _one_of(condition: bool | jax.Array, yes, no):
 @dataclass(frozen=True)
 class Agent(Model):
     """A model that acts and learns: the pure functions of an agent. Holds no parameters."""
+
+    def on_any_schedule(self) -> "Agent":
+        """The same agent, without what only a run asks about.
+
+        None of its functions reads the schedule, so those who compile them do it for this one:
+        agents that differ in their schedules alone share their programs.
+        """
+        schedule = ScheduleConfig(phase_environment_steps=10**6)  # as long as any sequence
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, schedule=schedule))
 
     def init(self, seed: jax.Array | int) -> AgentState:
         """A fresh agent of that seed."""

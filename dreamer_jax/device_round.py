@@ -276,10 +276,11 @@ class DeviceRounds:
 
     def _one_round(self, *arguments):
         ticks = self._agent.config.schedule.phase_ticks
-        return whole_round(self._agent, self._env, *arguments, ticks=ticks, **self._settings())
+        agent = self._agent.on_any_schedule()
+        return whole_round(agent, self._env, *arguments, ticks=ticks, **self._settings())
 
     def _updates_of_round(self, *arguments):
-        return store_and_update(self._agent, *arguments, **self._settings())
+        return store_and_update(self._agent.on_any_schedule(), *arguments, **self._settings())
 
     def forget(self) -> None:
         """Frees the device's copy; the next round makes it anew from the files."""

@@ -178,15 +178,16 @@ class Population:
     def __init__(
         self, agent: Agent, env, tasks: int, own_seeds: Sequence[int], placement: Placement
     ):
-        self._agent, self._env, self._tasks = agent, env, tasks
+        self._agent, self._env, self._tasks = agent.on_any_schedule(), env, tasks
+        self._schedule = agent.config.schedule
         self._placement, self._numbers = placement, placement.numbers()
         self.own_seeds = list(own_seeds)
         self.seeds = placement.spread(jnp.array(self.own_seeds, jnp.int32))
         over = placement.over_devices
-        self._init = over(functools.partial(init_members, agent), axes=(0,))
+        self._init = over(functools.partial(init_members, self._agent), axes=(0,))
         self._update = over(self._update_members, axes=(0, 0, 0), donate=(0, 1))
         self._collect = over(self._collect_members, axes=(0, 0, 0, None, None, 0))
-        self._diagnose = over(functools.partial(diagnose, agent), axes=(0, 0, 0, None))
+        self._diagnose = over(functools.partial(diagnose, self._agent), axes=(0, 0, 0, None))
         self.copied = over(copied, axes=(0,))
 
     def fresh(self) -> AgentState:
@@ -215,8 +216,7 @@ class Population:
         return self._update(state, sums, self._placement.spread(batch))
 
     def _update_members(self, state, sums, batch):
-        schedule = self._agent.config.schedule
-        mapping, chunk = schedule.mapping, schedule.mapping_chunk
+        mapping, chunk = self._schedule.mapping, self._schedule.mapping_chunk
         return update_members(self._agent, state, sums, batch, mapping=mapping, chunk=chunk)
 
     def collect(self, state: AgentState, phase: int, mode: Mode) -> Records:
@@ -237,7 +237,7 @@ class Population:
             updates,
             phase,
             tasks=self._tasks,
-            ticks=self._agent.config.schedule.phase_ticks,
+            ticks=self._schedule.phase_ticks,
             mode=mode,
             numbers=numbers,
         )

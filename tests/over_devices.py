@@ -280,27 +280,26 @@ def targets_begin_on_their_own_devices_as_on_one(folder):
     ):
         read, placement = load_sources(spec), place(len(spec.members), 2)
         assert placement.padded == len(spec.members) + 1
-        (state, report), (other, told) = (
-            transferred_members(spec, read, placement=where)
-            for where in (place(len(spec.members), 1), placement)
-        )
+        state, report = transferred_members(spec, read, placement=place(len(spec.members), 1))
+        (other, told), made = transferred_and_made(spec, read, placement)
+        # What devices made was divided among them before it came to the host.
+        assert_spread(made, placement)
         assert told.members == report.members == len(spec.method.targets(spec.seeds))
         assert told.rows == report.rows
         for one, two in zip(*map(jax.tree.leaves, ((state, report), (other, told))), strict=True):
             np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-5, atol=1e-6)
-        assert_made_apart(spec, read, placement)
 
 
-def assert_made_apart(spec, sources, placement):
-    """What devices made was divided among them before it came to the host."""
-    seen, own = [], Placement.own
-    Placement.own = lambda self, tree: seen.append(tree) or own(self, tree)
+def transferred_and_made(spec, sources, placement):
+    """The members of a transfer and its report, and what the devices made of them."""
+    made, own = [], Placement.own
+    Placement.own = lambda self, tree: made.append(tree) or own(self, tree)
     try:
-        transferred_members(spec, sources, placement=placement)
+        found = transferred_members(spec, sources, placement=placement)
     finally:
         Placement.own = own
-    ((state, report),) = seen
-    assert_spread((state, report), placement)
+    (tree,) = made
+    return found, tree
 
 
 def members_that_are_few_leave_devices_alone(folder):

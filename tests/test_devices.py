@@ -58,7 +58,8 @@ def test_on_one_device_programs_are_those_of_the_functions_themselves():
     sums, batch = members.zero_sums(state), batch_for(AGENT, 2)
     state, sums, _ = members.update(state, sums, batch)
     assert update_members._cache_size() == before + 1
-    state, *_ = update_members(AGENT, state, sums, batch, mapping="auto", chunk=1)
+    agent = AGENT.on_any_schedule()
+    state, *_ = update_members(agent, state, sums, batch, mapping="auto", chunk=1)
     assert update_members._cache_size() == before + 1
     records = members.collect(state, 0, "random")
     seeds = jnp.arange(2, dtype=jnp.int32)

@@ -113,8 +113,19 @@ def test_updates_are_not_compiled_again_after_the_first(finished):
     batch = run.replay.sample([0, 7], 0, learning.batch_size, learning.sequence_length)
     state = jax.tree.map(jnp.copy, run.state)
     sums = jax.tree.map(jnp.copy, run.sums)
-    update_members(AGENT, state, sums, batch, mapping="auto", chunk=1)
+    agent = AGENT.on_any_schedule()
+    update_members(agent, state, sums, batch, mapping="auto", chunk=1)
     assert update_members._cache_size() == before
+
+
+def test_runs_that_differ_in_their_schedules_share_their_programs(finished, tmp_path):
+    schedule = dataclasses.replace(
+        CONFIG.schedule, environment_steps=120, checkpoint_every=10, updates_per_phase=1
+    )
+    agent = Agent(dataclasses.replace(CONFIG, schedule=schedule), 2)
+    before = update_members._cache_size()
+    _, outcome = trained(tmp_path, agent=agent)
+    assert outcome == "finished" and update_members._cache_size() == before
 
 
 def test_members_of_one_population_do_not_influence_one_another(finished, tmp_path):

@@ -66,8 +66,6 @@ def estimate(run: PlannedRun, speed: Speed, devices: Choice = "all") -> Estimate
     has_host = any(task.has_host for task in envs.specs(spec.tasks))
     if on_device(agent, has_host, tasks, each).device:
         memory += replay_bytes(agent, tasks, each)
-    if schedule.collect == "beside":
-        memory += each * member_bytes(agent)  # of agents as they were before the updates
     seconds += speed.compile_seconds + sum(speed.tick_compile_seconds[task] for task in spec.tasks)
     return Estimate(seconds, memory, disk)
 
