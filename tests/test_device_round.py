@@ -70,8 +70,12 @@ def env(request):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, env):
     directory = tmp_path_factory.mktemp("device")
+    program = store_and_update if env.has_host else whole_round
+    before = program._cache_size()
     run, outcome = trained(directory, env)
     assert outcome == "finished"
+    # All rounds share one program, perhaps with runs of earlier tests.
+    assert program._cache_size() - before <= 1
     return directory, run
 
 
@@ -104,9 +108,12 @@ def test_a_replay_on_the_device_gives_the_metrics_of_the_path_with_files(finishe
         assert held[0][:size] == held[1][:size] and len(held[0]) == len(held[1])
 
 
-def test_all_rounds_share_one_program(finished, env):
+def test_all_rounds_share_one_program(finished, env, tmp_path):
     program = store_and_update if env.has_host else whole_round
-    assert program._cache_size() == 1
+    before = program._cache_size()
+    trained(tmp_path, env)
+    assert program._cache_size() == before
+    assert metrics(tmp_path) == metrics(finished[0])
 
 
 def stopping_in(monkeypatch, env, rounds, what):
