@@ -251,6 +251,7 @@ class DeviceRounds:
         placement: Placement | None = None,
     ):
         self._agent, self._env, self._files = agent, env, files
+        self._compiled = agent.on_any_schedule()
         self._seeds = np.asarray(seeds, np.int32)
         self._placement = placement or on_one_device(files.members)
         over = self._placement.over_devices
@@ -276,11 +277,10 @@ class DeviceRounds:
 
     def _one_round(self, *arguments):
         ticks = self._agent.config.schedule.phase_ticks
-        agent = self._agent.on_any_schedule()
-        return whole_round(agent, self._env, *arguments, ticks=ticks, **self._settings())
+        return whole_round(self._compiled, self._env, *arguments, ticks=ticks, **self._settings())
 
     def _updates_of_round(self, *arguments):
-        return store_and_update(self._agent.on_any_schedule(), *arguments, **self._settings())
+        return store_and_update(self._compiled, *arguments, **self._settings())
 
     def forget(self) -> None:
         """Frees the device's copy; the next round makes it anew from the files."""

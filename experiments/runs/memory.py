@@ -31,10 +31,11 @@ class OutOfMemoryError(RuntimeError):
 @functools.cache
 def traced_update(agent: Agent):
     """One member's update, traced for its shapes, and the shapes of its state and its batch."""
+    # The one that runs compile, which so shares the trace as it maps it over members.
+    agent = agent.on_any_schedule()
     learning = agent.config.learning
     batch = batch_shapes(agent, learning.batch_size, learning.sequence_length)
     state = jax.eval_shape(agent.init, jax.ShapeDtypeStruct((), jnp.int32))
-    # What maps it over members shares the trace.
     return update_member.trace(agent, state, batch), state, batch
 
 
