@@ -26,7 +26,7 @@ _IN_BOUNDS = "promise_in_bounds"
 
 
 def default_method() -> Method:
-    """The faster method on the default device: "matmul" on CPUs and NVIDIA cards, else "library"."""
+    """The faster method on the default device: "matmul" on CPUs and NVIDIA cards."""
     return "matmul" if jax.default_backend() in ("cpu", "gpu") else "library"
 
 
