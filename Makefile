@@ -35,13 +35,14 @@ help:  ## List the targets
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/%/N/; s/:.*## /|/' | \
 	  awk -F'|' '{printf "  make %-17s %s\n", $$1, $$2}'
 
-# One stamp per set of extras, so that the demo installs no test tools.
+# One stamp per set of extras, so that the demo installs no test tools. Modules are compiled when they
+# are first imported: most never are, and compiling them all takes half of the set-up.
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(STAMP)%: pyproject.toml constraints.txt | $(VENV)/bin/python
 	@echo "setting up $(VENV) (a few minutes the first time)"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(subst +,$(comma),$*)]"
+	@$(RUN) -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e ".[$(subst +,$(comma),$*)]"
 	@touch $@
 
 comma := ,
