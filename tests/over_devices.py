@@ -8,7 +8,6 @@ held by the real update too. Axis letters as in dreamer_jax.
 import dataclasses
 import json
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -17,23 +16,23 @@ import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
+from accidents import Killed
 from dreamer_jax import population
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from dreamer_jax.config import preset
 from dreamer_jax.devices import Placement, place
-from dreamer_jax.learning import AgentState
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Member, Population
-from dreamer_jax.randomness import update_key
 from dreamer_jax.training import Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
 from experiments.runs import evaluate as evaluation
 from experiments.runs.evaluate import load_agents
 from experiments.runs.start import load_sources, transferred_members
-from probes import Probe
+from probes import Inside
 from runs import batch_for, spec_of, write_run
+from small_agent import Small
 
 DEBUG = preset("debug")
 TASKS = ("probe/left", "probe/right")
@@ -48,40 +47,6 @@ def config_with(**schedule):
         "replay": "files",
     } | schedule
     return dataclasses.replace(DEBUG, schedule=dataclasses.replace(DEBUG.schedule, **settings))
-
-
-@dataclass(frozen=True)
-class Small(Agent):
-    """An agent whose one parameter learns the mean of what it has seen, with noise of its own."""
-
-    def init(self, seed):
-        value = jax.random.normal(jax.random.key(seed))
-        return self.start({"actor": {"value": value}}, seed)
-
-    def start(self, params, seed):
-        seed = jnp.asarray(seed, jnp.int32)
-        return AgentState(params, {}, jnp.int32(0), seed, jnp.bool_(True))
-
-    def update(self, state, batch):
-        value = state.params["actor"]["value"]
-        noise = jax.random.normal(update_key(state.seed, state.updates))
-        seen = batch.image.astype(jnp.float32).mean() / 255 + batch.reward.mean()
-        new = jnp.where(state.healthy, value + 0.1 * (seen + 0.1 * noise - value), value)
-        state = dataclasses.replace(
-            state, params={"actor": {"value": new}}, updates=state.updates + 1
-        )
-        return state, {"model_loss": (seen - value) ** 2}
-
-    def policy(self, params, carry, image, first, key, mode, updates=0):
-        noise = jax.random.normal(key, (self.action_size,))
-        seen = image.astype(jnp.float32).mean() / 255
-        return jnp.tanh(params["actor"]["value"] * seen + noise), carry
-
-
-class Inside(Probe):
-    """A probe that is a part of the program."""
-
-    has_host = False
 
 
 def made(directory, members, devices, agent, make_env, resume=False):
@@ -189,10 +154,6 @@ def padding_is_nowhere_to_be_seen(folder):
         assert streams == [f"member_00{member}" for member in range(7)]
         tree = load_tree(run.directory / "checkpoints")
         assert {leaf.shape[0] for leaf in jax.tree.leaves(tree)} == {7}
-
-
-class Killed(BaseException):
-    """Stands for what ends a process without letting it save."""
 
 
 def killed_on_many_devices_a_run_goes_on_with_fewer(folder):
