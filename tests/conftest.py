@@ -47,3 +47,5 @@ def pytest_collection_finish():
     # What imports have made stays; garbage is looked for in what tests make.
     gc.collect()
     gc.freeze()
+    # Programs are traced in millions of objects, few of them garbage.
+    gc.set_threshold(50_000, 20, 50)
