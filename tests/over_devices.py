@@ -31,7 +31,7 @@ from experiments.runs import evaluate as evaluation
 from experiments.runs.evaluate import load_agents
 from experiments.runs.start import load_sources, transferred_members
 from probes import Inside
-from runs import batch_for, random_params, spec_of, write_run
+from runs import batch_for, random_members, spec_of, write_run
 from small_agent import Small
 
 DEBUG = preset("debug")
@@ -192,10 +192,9 @@ def the_real_update_is_the_same_on_a_device_of_its_own(folder):
     agent = Agent(DEBUG, 2)
     batch, results = batch_for(agent, 2), []
     fresh = jax.tree.map(lambda x: np.zeros((2, *x.shape), x.dtype), jax.eval_shape(agent.init, 0))
-    params = [random_params(agent, seed) for seed in range(2)]
     states = dataclasses.replace(
         fresh,
-        params=jax.tree.map(lambda *x: np.stack(x), *params),
+        params=random_members(agent, range(2)),
         seed=np.arange(2, dtype=np.int32),
         healthy=np.ones(2, bool),
     )

@@ -35,6 +35,11 @@ def random_params(agent, seed=0):
     return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
 
 
+def random_members(agent, seeds):
+    """Such parameters of each member, leaves [P, ...]."""
+    return jax.tree.map(lambda *x: np.stack(x), *[random_params(agent, seed) for seed in seeds])
+
+
 def write_run(directory, spec: RunSpec, seed=0, keep=False, counters=None) -> Source:
     """A results folder of agents with random parameters, after the run's method.
 

@@ -14,7 +14,7 @@ from dreamer_jax.diagnosis import diagnose
 from dreamer_jax.population import init_members
 from dreamer_jax.rollout import collect
 from probes import Probe
-from runs import random_params
+from runs import random_members
 
 A, STORED, UPDATES, SEEDS = 2, 10, 100, 3
 CONFIG = preset("debug")
@@ -32,7 +32,7 @@ def stored_batches(agent):
     records = collect(
         agent,
         Probe(action_size=A),
-        jax.tree.map(lambda x: x[None], random_params(agent)),
+        random_members(agent, [0]),
         jnp.zeros(1, jnp.int32),
         jnp.zeros(1, jnp.int32),
         jnp.int32(0),
