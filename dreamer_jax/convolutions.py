@@ -1,9 +1,10 @@
 """Stride-2 convolutions and transposed convolutions, as library calls or as matrix products.
 
 XLA's CPU backend is slow at strided and transposed convolutions, and slowest at their gradients;
-the same sums arranged as matrix products take a fraction of the time. Accelerators have good
-convolution kernels of their own. Both layers therefore have two ways to be computed and one
-definition of their parameters, so that a tree trained on one kind of device runs on another.
+the same sums arranged as matrix products take a fraction of the time. On NVIDIA cards they do too,
+above all for populations, whose convolutions are grouped ones there (benchmarks/RESULTS.md). Both
+layers have two ways to be computed and one definition of their parameters, so that a tree trained
+on one kind of device runs on another.
 
 Every window has stride 2 and no padding ("VALID"). In the shapes below k is the side of the
 kernel, C the input channels, O the output channels, and "..." any number of batch axes.
@@ -25,8 +26,8 @@ _IN_BOUNDS = "promise_in_bounds"
 
 
 def default_method() -> Method:
-    """Return the faster method on the default device: "matmul" on a CPU, "library" elsewhere."""
-    return "matmul" if jax.default_backend() == "cpu" else "library"
+    """The faster method on the default device: "matmul" on CPUs and NVIDIA cards."""
+    return "matmul" if jax.default_backend() in ("cpu", "gpu") else "library"
 
 
 def convolution(x, kernel, bias, *, relu: bool = False, method: Method | None = None):

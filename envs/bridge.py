@@ -65,7 +65,13 @@ class HostCalls:
                     self._error = error
             return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes(len(rows)))
 
-        return mapped_rows(lambda rows: io_callback(guarded, shapes(len(rows)), rows, ordered=True))
+        def call(rows):
+            results = io_callback(guarded, shapes(len(rows)), rows, ordered=True)
+            # Without the barrier XLA writes results that a scan keeps by a fusion that takes the
+            # callback's token along, and ends the process over it (NVIDIA cards, jaxlib 0.11.2).
+            return jax.lax.optimization_barrier(results)
+
+        return mapped_rows(call)
 
     def check(self) -> None:
         """Wait for callbacks under way and raise the error that one of them met, if any."""

@@ -146,7 +146,9 @@ class BulletSimulator:
             renderer=pybullet.ER_TINY_RENDERER,
         )[2]
         rgba = np.asarray(pixels, np.uint8).reshape(size, size, 4)
-        return np.where(rgba[..., 3:] == 0, np.uint8(255), rgba[..., :3])
+        # A pixel is one word: choosing among words takes a quarter of the time of choosing bytes.
+        words = np.where(rgba[..., 3] == 0, np.uint32(0xFFFFFFFF), rgba.view(np.uint32)[..., 0])
+        return np.ascontiguousarray(words.view(np.uint8).reshape(size, size, 4)[..., :3])
 
     def close(self) -> None:
         """Disconnect from the physics engine."""

@@ -80,9 +80,13 @@ def averaged(image: np.ndarray, factor: int) -> np.ndarray:
     """The mean of each `factor` x `factor` block of pixels, rounded half up:
     uint8 [height * factor, width * factor, 3] -> uint8 [height, width, 3]."""
     height, width = image.shape[0] // factor, image.shape[1] // factor
-    blocks = image.reshape(height, factor, width, factor, 3)
+    # Whole arrays are added up: NumPy's reduction over axes this short takes ten times as long.
+    rows = image.reshape(height, factor, width * factor, 3)
+    lines = sum((rows[:, i] for i in range(1, factor)), rows[:, 0].astype(np.uint32))
+    columns = lines.reshape(height, width, factor, 3)
+    total = sum(columns[:, :, i] for i in range(factor))
     area = factor * factor
-    return ((blocks.sum(axis=(1, 3), dtype=np.uint32) + area // 2) // area).astype(np.uint8)
+    return ((total + area // 2) // area).astype(np.uint8)
 
 
 def make_simulator(task: TaskSpec, image_size: int) -> Simulator:

@@ -85,6 +85,21 @@ def test_scan_makes_one_tick_after_another_in_order(population):
     assert time_steps.reward.tolist() == [1, 5, 9, 13, 17, 21]
 
 
+def test_what_a_callback_gives_is_kept_apart_from_what_keeps_it(population):
+    """XLA for NVIDIA cards ends the process where a scan's array and a token share a fusion."""
+
+    def play(slot, key):
+        state, _ = population.reset(slot, key)
+        return jax.lax.scan(lambda *x: population.step(x[0], jnp.zeros(3)), state, length=2)[1]
+
+    lines = jax.jit(jax.vmap(play, (0, None))).lower(jnp.arange(6), KEY).as_text().splitlines()
+    calls = [number for number, line in enumerate(lines) if "callback" in line and "call" in line]
+    assert len(calls) == 2
+    for number in calls:
+        result = lines[number].split("=")[0].split(":")[0].strip()
+        assert f"optimization_barrier {result}#1, {result}#2" in lines[number + 1]
+
+
 def test_after_a_fall_the_next_tick_resets_and_ignores_its_action(population):
     @jax.jit
     def phase(key):

@@ -202,10 +202,11 @@ def test_the_gradient_of_images_is_not_computed_unless_asked_for():
     assert products(argnums=(0, 1)) == 3
 
 
-def test_the_default_is_matmul_on_a_cpu_and_the_library_elsewhere(monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    assert default_method() == "matmul"
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+def test_the_default_is_matmul_on_cpus_and_nvidia_cards_and_the_library_elsewhere(monkeypatch):
+    for backend in "cpu", "gpu":
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        assert default_method() == "matmul"
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
     assert default_method() == "library"
 
     x, kernel, bias = draw((), 6, 6, 4, 3, 5)

@@ -50,7 +50,7 @@ def test_the_zeros_of_a_transposed_convolution_count_nothing():
     assert count(gradients, shape(7, 5, 5, 4), shape(6, 6, 4, 3)) < 3 * expected + 2 * others
 
 
-def test_an_update_is_as_much_arithmetic_with_the_layers_of_accelerators(monkeypatch):
+def test_an_update_is_as_much_arithmetic_with_the_layers_of_the_library(monkeypatch):
     config = preset("cpu")
     here = measurement.operations(Agent(config, 2))
     monkeypatch.setattr(convolutions, "default_method", lambda: "library")
