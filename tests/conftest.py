@@ -10,6 +10,8 @@ os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+# Where in the sources each operation comes from is for profiles; tracing is faster without.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # What tests compile runs for milliseconds: quick compilation matters more than quick code.
 _flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
 # Later versions do not know the first of these flags, and end the process that sets it.
@@ -19,20 +21,34 @@ if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
 os.environ["XLA_FLAGS"] = " ".join(_flags).strip()
 
 LONGEST = (
-    "test_accelerator",
     "test_brax",
-    "test_tables",
-    "test_methods_command_line",
     "test_agent",
     "test_training",
+    "test_devices",
+    "test_accelerator",
+    "test_tables",
+    "test_methods_command_line",
+    "test_methods",
     "test_command_line",
+    "test_device_round",
     "test_precision",
-    "test_transfer_safety",
-    "test_transfer_plan",
-    "test_transfer_merging",
-    "test_envs",
+    "test_ray_casting",
+    "test_ahead",
+    "test_api",
+    "test_demo",
+    "test_copying",
+    "test_rollout",
+    "test_bridge",
+    "test_convolutions",
     "test_two_cores",
+    "test_transfer_recipes",
+    "test_transfer_safety",
+    "test_memory",
+    "test_docs",
     "test_golden",
+    "test_transfer_surgery",
+    "test_diagnosis",
+    "test_transfer_merging",
     "test_package",
 )
 """Files that take a worker longest come first, so that none is begun when the rest is done."""
@@ -47,3 +63,5 @@ def pytest_collection_finish():
     # What imports have made stays; garbage is looked for in what tests make.
     gc.collect()
     gc.freeze()
+    # Programs are traced in millions of objects, few of them garbage.
+    gc.set_threshold(50_000, 20, 50)

@@ -8,7 +8,6 @@ held by the real update too. Axis letters as in dreamer_jax.
 import dataclasses
 import json
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -17,23 +16,23 @@ import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
+from accidents import Killed
 from dreamer_jax import population
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from dreamer_jax.config import preset
 from dreamer_jax.devices import Placement, place
-from dreamer_jax.learning import AgentState
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Member, Population
-from dreamer_jax.randomness import update_key
 from dreamer_jax.training import Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
 from experiments.runs import evaluate as evaluation
 from experiments.runs.evaluate import load_agents
 from experiments.runs.start import load_sources, transferred_members
-from probes import Probe
-from runs import batch_for, spec_of, write_run
+from probes import Inside
+from runs import batch_for, random_members, spec_of, write_run
+from small_agent import Small
 
 DEBUG = preset("debug")
 TASKS = ("probe/left", "probe/right")
@@ -48,40 +47,6 @@ def config_with(**schedule):
         "replay": "files",
     } | schedule
     return dataclasses.replace(DEBUG, schedule=dataclasses.replace(DEBUG.schedule, **settings))
-
-
-@dataclass(frozen=True)
-class Small(Agent):
-    """An agent whose one parameter learns the mean of what it has seen, with noise of its own."""
-
-    def init(self, seed):
-        value = jax.random.normal(jax.random.key(seed))
-        return self.start({"actor": {"value": value}}, seed)
-
-    def start(self, params, seed):
-        seed = jnp.asarray(seed, jnp.int32)
-        return AgentState(params, {}, jnp.int32(0), seed, jnp.bool_(True))
-
-    def update(self, state, batch):
-        value = state.params["actor"]["value"]
-        noise = jax.random.normal(update_key(state.seed, state.updates))
-        seen = batch.image.astype(jnp.float32).mean() / 255 + batch.reward.mean()
-        new = jnp.where(state.healthy, value + 0.1 * (seen + 0.1 * noise - value), value)
-        state = dataclasses.replace(
-            state, params={"actor": {"value": new}}, updates=state.updates + 1
-        )
-        return state, {"model_loss": (seen - value) ** 2}
-
-    def policy(self, params, carry, image, first, key, mode, updates=0):
-        noise = jax.random.normal(key, (self.action_size,))
-        seen = image.astype(jnp.float32).mean() / 255
-        return jnp.tanh(params["actor"]["value"] * seen + noise), carry
-
-
-class Inside(Probe):
-    """A probe that is a part of the program."""
-
-    has_host = False
 
 
 def made(directory, members, devices, agent, make_env, resume=False):
@@ -148,8 +113,7 @@ def the_number_of_devices_does_not_matter(folder):
         ("host-beside", "device", counting, "beside"),
     ):
         agent = Small(config_with(replay=replay, collect=collect), 2)
-        counts = (1, 8) if make_env is counting else (1, 2, 4, 8)
-        for devices in counts:
+        for devices in (1, 2, 8) if name == "files" else (1, 8):
             run = trained(folder / f"{name}-{devices}", 8, devices, agent, make_env)
             assert run.placement.count == devices and run.counters.updates == 12
             if devices > 1:
@@ -191,10 +155,6 @@ def padding_is_nowhere_to_be_seen(folder):
         assert {leaf.shape[0] for leaf in jax.tree.leaves(tree)} == {7}
 
 
-class Killed(BaseException):
-    """Stands for what ends a process without letting it save."""
-
-
 def killed_on_many_devices_a_run_goes_on_with_fewer(folder):
     for members, fewer in ((8, 2), (7, 1)):
         agent = Small(config_with(checkpoint_every=40), 2)
@@ -231,14 +191,20 @@ def a_replay_on_the_devices_is_filled_from_files_of_another_number(folder):
 def the_real_update_is_the_same_on_a_device_of_its_own(folder):
     agent = Agent(DEBUG, 2)
     batch, results = batch_for(agent, 2), []
+    fresh = jax.tree.map(lambda x: np.zeros((2, *x.shape), x.dtype), jax.eval_shape(agent.init, 0))
+    states = dataclasses.replace(
+        fresh,
+        params=random_members(agent, range(2)),
+        seed=np.arange(2, dtype=np.int32),
+        healthy=np.ones(2, bool),
+    )
     for devices in (1, 2):
         members = Population(agent, None, 1, [3, 4], place(2, devices))
-        states = jax.jit(jax.vmap(agent.init))(jnp.arange(2)) if not results else results[0][0]
         state = members.put(jax.tree.map(jnp.array, states))
-        sums = members.zero_sums(state)
-        results.append((states, *members.update(state, sums, batch)))
-    assert_spread(results[1][1:], place(2, 2))
-    for one, two in zip(*(jax.tree.leaves(x[1:]) for x in results), strict=True):
+        results.append(members.update(state, members.zero_sums(state), batch))
+    assert results[0][0].healthy.all() and results[0][0].updates.tolist() == [1, 1]
+    assert_spread(results[1], place(2, 2))
+    for one, two in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-3, atol=1e-5)
 
 

@@ -69,6 +69,12 @@ class Probe:
         pass
 
 
+class Inside(Probe):
+    """A probe that is a part of the program."""
+
+    has_host = False
+
+
 class Walk(Probe):
     """Five cells in a row, shown as a bright column; a choice steps left, not at all, or right.
 

@@ -1,6 +1,7 @@
 """Results folders made in a moment: a run as its spec says, of agents that have not trained."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -28,11 +29,21 @@ def spec_of(*tasks, seeds=(0,), config=CONFIG, method=None, **settings) -> RunSp
     return RunSpec(names, seeds, config, methods.make(method, settings))
 
 
+@functools.cache
+def shapes_of(agent):
+    """Of an agent's parameters."""
+    return jax.eval_shape(agent.init_params, jax.random.key(0))
+
+
 def random_params(agent, seed=0):
     """Parameters of the shapes of an agent's, without compiling its initialisation."""
     random = np.random.default_rng(seed)
-    shapes = jax.eval_shape(agent.init_params, jax.random.key(0))
-    return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
+    return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes_of(agent))
+
+
+def random_members(agent, seeds):
+    """Such parameters of each member, leaves [P, ...]."""
+    return jax.tree.map(lambda *x: np.stack(x), *[random_params(agent, seed) for seed in seeds])
 
 
 def write_run(directory, spec: RunSpec, seed=0, keep=False, counters=None) -> Source:

@@ -1,9 +1,11 @@
 """The benchmark of a card: whole, on the CPU and as small as can be, and what becomes of failures.
 
-The processes that measure are real ones in the first tests, and shell scripts in those on failures.
+Of the processes that measure, those of the first part and of the peer that fails are real ones in
+the first tests; they are shell scripts in those on failures.
 """
 
 import dataclasses
+import io
 import json
 import signal
 import subprocess
@@ -41,6 +43,28 @@ def rows_of(path):
     return {(row["part"], row["case"]): row for row in read(path)["rows"]}
 
 
+class InThisProcess:
+    """In the place of a process that measures a part: all of them share what one has traced and
+    compiled."""
+
+    returncode = 0
+
+    def __init__(self, words, **options):
+        *_, part, request = words
+        self.stdout = io.StringIO()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(measures, "own_output", lambda: self._say)
+            patch.setattr(measures, "keep_freed_memory", lambda: None)
+            measures.main(part, json.loads(request))
+        self.stdout.seek(0)
+
+    def _say(self, event):
+        self.stdout.write(json.dumps(event) + "\n")
+
+    def wait(self, seconds):
+        return self.returncode
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("accelerator")
@@ -49,7 +73,15 @@ def measured(tmp_path_factory):
     )
     words = ["accelerator", "--sizes", "debug", "--out", str(folder / "card.json")]
     words += ["--peer", peer, "--peak-tflops", "0.5", "2"]
-    assert main(words) == 0
+    first, popen = parts(SIZES["debug"])[0].name, subprocess.Popen
+
+    def begun(arguments, **options):
+        measures_here = arguments[:-2] == command.MEASURES and arguments[-2] != first
+        return (InThisProcess if measures_here else popen)(arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subprocess, "Popen", begun)
+        assert main(words) == 0
     return folder, words
 
 

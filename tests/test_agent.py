@@ -57,6 +57,17 @@ def update(agent):
 
 
 @pytest.fixture(scope="module")
+def observe(agent):
+    return jax.jit(agent.observe)
+
+
+@pytest.fixture(scope="module")
+def discrete_params():
+    """Of three choices."""
+    return jax.jit(Agent(CONFIG, 3, discrete=True).init_params)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
 def states(agent):
     """Of three members."""
     return jax.jit(jax.vmap(agent.init))(jnp.arange(3))
@@ -83,10 +94,13 @@ def test_updates_lower_the_losses_on_one_repeated_batch(update, state):
     # Plain images: those of batch_of are noise, which no decoder of this size can learn.
     batch = batch._replace(image=np.full_like(batch.image, 255))
     _, before = update(state, batch)
-    for _ in range(300):
+    history = []
+    for _ in range(150):
         state, metrics = update(state, batch)
-    assert metrics["image_loss"] < 0.5 * before["image_loss"]
-    assert metrics["reward_loss"] < 0.9 * before["reward_loss"]
+        history.append((metrics["image_loss"], metrics["reward_loss"]))
+    image, reward = np.mean(history[-50:], axis=0)
+    assert image < 0.5 * before["image_loss"]
+    assert reward < 0.9 * before["reward_loss"]
 
 
 def test_an_update_is_a_function_of_state_and_batch_alone(update, state):
@@ -128,8 +142,8 @@ def test_an_unknown_mapping_is_refused_with_the_choices(agent):
         map_members(agent.update, "pmap")
 
 
-def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, state):
-    posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(0))
+def test_the_actor_learns_through_the_dynamics_and_does_not_touch_them(agent, state, observe):
+    posterior, _, _ = observe(state.params, batch_of(), jax.random.key(0))
 
     def loss(params):
         return behaviour_loss(agent, {}, params, posterior, jax.random.key(1))[0]
@@ -162,8 +176,8 @@ def test_no_gradient_of_actor_or_value_reaches_the_world_model(agent, state):
     assert optax.tree.norm(gradient) == 0.0
 
 
-def test_the_gradients_of_actor_and_value_are_those_of_their_own_losses(agent, state):
-    posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(0))
+def test_the_gradients_of_actor_and_value_are_those_of_their_own_losses(agent, state, observe):
+    posterior, _, _ = observe(state.params, batch_of(), jax.random.key(0))
     parts = {name: state.params[name] for name in ("actor", "value")}
 
     def gradient_of(name):
@@ -184,7 +198,7 @@ def test_the_gradients_of_actor_and_value_are_those_of_their_own_losses(agent, s
 
 def test_frozen_components_do_not_move_and_cost_no_optimiser_memory(update, state):
     frozen = Agent(with_settings("learning", frozen=("encoder", "value")), A)
-    start = jax.jit(frozen.init)(0)
+    start = frozen.start(state.params, 0)
     new = start
     step = jax.jit(frozen.update)
     for seed in range(3):
@@ -376,9 +390,9 @@ def test_a_termination_head_learns_the_discount_and_shortens_imagined_returns():
     assert metrics["termination_loss"] < 0.7
 
 
-def test_discrete_actions_are_one_hot_and_their_actor_learns():
+def test_discrete_actions_are_one_hot_and_their_actor_learns(discrete_params):
     agent = Agent(CONFIG, 3, discrete=True)
-    state = jax.jit(agent.init)(0)
+    state = agent.start(discrete_params, 0)
     batch = batch_of()
     one_hot = np.eye(3, dtype=np.float32)[random.integers(0, 3, (B, L))]
     new, metrics = jax.jit(agent.update)(state, batch._replace(action=one_hot))
@@ -397,9 +411,9 @@ def test_discrete_actions_are_one_hot_and_their_actor_learns():
             assert sorted(action.tolist()) == [0.0, 0.0, 1.0]
 
 
-def test_entropys_weight_pulls_an_actor_towards_even_odds():
+def test_entropys_weight_pulls_an_actor_towards_even_odds(discrete_params):
     agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=3e-3), 3, True)
-    state, batch, update = jax.jit(agent.init)(0), batch_of(), jax.jit(agent.update)
+    state, batch, update = agent.start(discrete_params, 0), batch_of(), jax.jit(agent.update)
     batch = batch._replace(action=np.eye(3, dtype=np.float32)[np.zeros((B, L), int)])
     entropies = []
     for _ in range(30):
@@ -409,11 +423,11 @@ def test_entropys_weight_pulls_an_actor_towards_even_odds():
     assert np.log(3) - entropies[-1] < 0.2 * (np.log(3) - entropies[0])
 
 
-def test_entropys_weight_spreads_continuous_actions_over_their_range():
+def test_entropys_weight_spreads_continuous_actions_over_their_range(state):
     # A squashed Gaussian comes nearest to the uniform distribution, whose entropy is log 2 for
     # each of the A actions, at a spread of about 0.9.
     agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=1e-2), A)
-    state, batch, update = jax.jit(agent.init)(0), batch_of(), jax.jit(agent.update)
+    state, batch, update = agent.start(state.params, 0), batch_of(), jax.jit(agent.update)
     history = []
     for _ in range(150):
         state, metrics = update(state, batch)
@@ -424,12 +438,12 @@ def test_entropys_weight_spreads_continuous_actions_over_their_range():
     assert 0.6 < last_std < 1.3
 
 
-def test_the_entropys_weight_falls_linearly_to_its_end(agent, state):
+def test_the_entropys_weight_falls_linearly_to_its_end(state, observe):
     falling = Agent(
         with_settings("learning", entropy_scale=0.5, entropy_scale_end=0.1, entropy_decay=1000),
         A,
     )
-    posterior, _, _ = jax.jit(agent.observe)(state.params, batch_of(), jax.random.key(1))
+    posterior, _, _ = observe(state.params, batch_of(), jax.random.key(1))
 
     @jax.jit
     def loss(updates):
@@ -470,10 +484,10 @@ def test_the_images_spread_divides_its_loss_by_its_square(state):
     assert losses[1.0]["image_loss"] == losses[0.5]["image_loss"]
 
 
-def test_the_divergence_of_first_records_is_told_apart(agent, state):
+def test_the_divergence_of_first_records_is_told_apart(agent, state, observe):
     batch, key = batch_of(), jax.random.key(1)
     _, (_, metrics) = jax.jit(functools.partial(model_loss, agent, {}))(state.params, batch, key)
-    posterior, mean, std = jax.jit(agent.observe)(state.params, batch, key)
+    posterior, mean, std = observe(state.params, batch, key)
     kl = gaussian_kl(posterior.mean, posterior.std, mean, std)
     assert_allclose(metrics["kl_at_start"], kl[:, 0].mean(), rtol=1e-4)
     assert_allclose(metrics["kl_share_below_floor"], (kl < 3.0).mean())

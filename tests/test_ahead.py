@@ -1,7 +1,7 @@
 """Phases collected beside updates: which policy plays them, and that a round is done or is not.
 
 P = 2 members, one task, 5 rounds of 2 updates, the first of random actions. With the replay in
-files and on the device.
+files and on the device. Agents are of one number.
 """
 
 import dataclasses
@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from accidents import Killed, full_disk, in_call, raising
 from dreamer_jax import device_round, population
-from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Member, Population
-from dreamer_jax.replay import Replay
 from dreamer_jax.training import Run
-from probes import Probe
+from probes import Inside, Probe
+from small_agent import Small, diagnose
 
 ENV = Probe()
 MEMBERS = (Member(0, "one"), Member(7, "two"))
@@ -32,7 +32,7 @@ def agent_with(replay, collect="beside"):
     config = preset("debug")
     settings = {"environment_steps": 200, "replay": replay, "collect": collect}
     schedule = dataclasses.replace(config.schedule, **settings)
-    return Agent(dataclasses.replace(config, schedule=schedule), 2)
+    return Small(dataclasses.replace(config, schedule=schedule), 2)
 
 
 def run_in(directory, agent, env=ENV, **options):
@@ -48,6 +48,13 @@ def trained(directory, agent, **options):
 
 def metrics(directory):
     return (directory / "metrics.jsonl").read_bytes()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def diagnosed():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(population, "diagnose", diagnose)
+        yield
 
 
 @pytest.fixture(scope="module", params=UPDATES)
@@ -76,28 +83,12 @@ def assert_goes_on_as(finished, directory, agent):
 
 def in_update(patch, agent, number, what):
     """Does something in the midst of the program of updates of that number."""
-    module, name = UPDATES[agent.config.schedule.replay]
-    original, left = getattr(module, name), [number]
-
-    def counting(*arguments, **options):
-        left[0] -= 1
-        if left[0] == 0:
-            what()
-        return original(*arguments, **options)
-
-    patch.setattr(module, name, counting)
+    in_call(patch, *UPDATES[agent.config.schedule.replay], number, what)
 
 
 def first_update(agent, rounds):
     """The number of the first program of updates after so many rounds."""
     return 2 * rounds - 1 if agent.config.schedule.replay == "files" else rounds
-
-
-def raising(error):
-    def action():
-        raise error
-
-    return action
 
 
 # --- which policy ---------------------------------------------------------------------------------
@@ -147,9 +138,7 @@ def test_updates_are_made_while_the_phase_is_played(agent, tmp_path, monkeypatch
 
 
 def test_an_environment_without_a_host_is_played_beside_updates_too(agent, finished, tmp_path):
-    inside = Probe()
-    inside.has_host = False
-    assert trained(tmp_path, agent, env=inside)[1] == "finished"
+    assert trained(tmp_path, agent, env=Inside())[1] == "finished"
     assert metrics(tmp_path) == metrics(finished[0])
 
 
@@ -164,10 +153,6 @@ def test_ctrl_c_ends_the_round_with_its_phase(agent, finished, tmp_path, monkeyp
     run.close()
     assert (run.counters.rounds, run.counters.updates) == (4, 6)
     assert_goes_on_as(finished, tmp_path, agent)
-
-
-class Killed(BaseException):
-    """Stands for what ends a process without letting it save."""
 
 
 @pytest.mark.parametrize("earlier", [0, 1])
@@ -260,17 +245,10 @@ def test_a_simulator_given_up_after_ctrl_c_is_told_and_ends_the_run_before_the_r
 def test_a_phase_that_cannot_be_written_leaves_the_run_as_it_was_before_the_round(
     agent, finished, tmp_path, monkeypatch
 ):
-    run, append = run_in(tmp_path, agent), Replay.append
-    with monkeypatch.context() as patch:
-
-        def full(self, records):
-            if self.lengths[0, 0] == 3 * 21:
-                raise OSError("no space left")
-            append(self, records)
-
-        patch.setattr(Replay, "append", full)
-        with pytest.raises(OSError, match="no space left"):
-            run.train()
+    run = run_in(tmp_path, agent)
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no space left"):
+        full_disk(patch, 3 * 21)
+        run.train()
     run.close()
     assert (run.counters.rounds, run.counters.updates) == (3, 4)
     assert_goes_on_as(finished, tmp_path, agent)
@@ -293,8 +271,7 @@ def test_a_member_that_turns_not_finite_is_frozen_and_the_other_goes_on(
 ):
     directory, whole = finished
     run = run_in(tmp_path, agent)
-    poisoned = run.state.params["reward"]["out"]["bias"].at[1].set(jnp.nan)
-    run.state.params["reward"]["out"]["bias"] = poisoned
+    run.state.params["loss"]["shift"] = jnp.array([0.0, jnp.nan])
     assert run.train() == "finished"
     run.close()
     assert "member 1 (two, seed 7) met a loss" in " ".join(capsys.readouterr().out.split())

@@ -1,5 +1,5 @@
 """Rounds with the replay on the device, beside the same rounds with files: as one program each, and
-with simulators on the host.
+with simulators on the host. By agents of one number, but for the comparison with files.
 
 P = 2 members, K = 2 tasks, 4 rounds; of each stream's 84 records the newest 25 are sampled, and the
 device has room for two phases of 21.
@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer_jax import device_replay, device_round
+from accidents import Killed, full_disk, in_call, raising
+from dreamer_jax import device_replay, device_round, population
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.device_round import on_device, store_and_update, whole_round
@@ -24,13 +25,8 @@ from dreamer_jax.records import Records
 from dreamer_jax.replay import Replay
 from dreamer_jax.schedule import Schedule
 from dreamer_jax.training import Run
-from probes import BrokenProbe, Probe
-
-
-class Inside(Probe):
-    """A probe that says that it needs no host."""
-
-    has_host = False
+from probes import BrokenProbe, Inside, Probe
+from small_agent import Small, diagnose
 
 
 def config_with(**settings):
@@ -40,9 +36,9 @@ def config_with(**settings):
 
 
 # Shared, so that all runs of these tests share their compiled functions.
-AGENT = Agent(config_with(), 2)
+AGENT = Small(config_with(), 2)
 ENVS = {"one program": Inside(), "host": Probe()}
-FILES = Agent(config_with(replay="files"), 2)
+FILES = Small(config_with(replay="files"), 2)
 MEMBERS = (Member(0, "one"), Member(7, "two"))
 TASKS = ("probe/left", "probe/right")
 
@@ -60,6 +56,13 @@ def trained(directory, env, **options):
 
 def metrics(directory):
     return (directory / "metrics.jsonl").read_bytes()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def diagnosed():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(population, "diagnose", diagnose)
+        yield
 
 
 @pytest.fixture(scope="module", params=ENVS, ids=lambda name: name.replace(" ", "_"))
@@ -91,21 +94,36 @@ def assert_same(directory, other, rel):
             assert two[name] == value, (one["kind"], name)
 
 
-def test_a_replay_on_the_device_gives_the_metrics_of_the_path_with_files(finished, env, tmp_path):
-    directory, run = finished
-    other, outcome = trained(tmp_path, env, agent=FILES)
-    assert outcome == "finished" and run.device_rounds and not other.device_rounds
-    kinds = {row["kind"] for row in read_metrics(directory)}
-    assert kinds == {"collect", "update", "evaluation"} and run.counters.updates == 16
-    assert_same(directory, tmp_path, rel=1e-3)
+def assert_same_run(run, other):
+    """Of a replay on the device and one in files: the same rows, and records of the same rounds."""
+    assert run.device_rounds and not other.device_rounds and run.counters.updates == 16
+    kinds = {row["kind"] for row in read_metrics(run.directory)}
+    assert kinds == {"collect", "update", "evaluation"}
+    assert_same(run.directory, other.directory, rel=1e-3)
     # What no update has touched is the same to the bit: the round of random actions, all rows of it
     # and the records of every stream.
-    random = [metrics(folder).splitlines()[:4] for folder in (directory, tmp_path)]
+    random = [metrics(x.directory).splitlines()[:4] for x in (run, other)]
     assert random[0] == random[1]
     for stream in np.ndindex(2, 2):
         held = [x.replay.path(*stream).read_bytes() for x in (run, other)]
         size = 21 * run.replay.dtype.itemsize
         assert held[0][:size] == held[1][:size] and len(held[0]) == len(held[1])
+
+
+def test_a_replay_on_the_device_gives_the_metrics_of_the_path_with_files(finished, env, tmp_path):
+    other, outcome = trained(tmp_path, env, agent=FILES)
+    assert outcome == "finished"
+    assert_same_run(finished[1], other)
+
+
+def test_so_it_does_for_agents_of_networks(tmp_path):
+    runs = []
+    for replay in ("device", "files"):
+        agent = Agent(config_with(replay=replay), 2)
+        run, outcome = trained(tmp_path / replay, ENVS["one program"], agent=agent)
+        assert outcome == "finished"
+        runs.append(run)
+    assert_same_run(*runs)
 
 
 def test_all_rounds_share_one_program(finished, env, tmp_path):
@@ -116,19 +134,10 @@ def test_all_rounds_share_one_program(finished, env, tmp_path):
     assert metrics(tmp_path) == metrics(finished[0])
 
 
-def stopping_in(monkeypatch, env, rounds, what):
+def stopping_in(patch, env, rounds, what):
     """Does something in the midst of the updates of the round of that number."""
     name = "store_and_update" if env.has_host else "whole_round"
-    original, left = getattr(device_round, name), [rounds]
-
-    def counting(*arguments, **options):
-        left[0] -= 1
-        result = original(*arguments, **options)
-        if left[0] == 0:
-            what()
-        return result
-
-    monkeypatch.setattr(device_round, name, counting)
+    in_call(patch, device_round, name, rounds, what)
 
 
 @pytest.mark.parametrize("agent", [AGENT, FILES], ids=["device", "files"])
@@ -151,17 +160,6 @@ def test_a_run_stopped_by_ctrl_c_goes_on_with_either_replay(
     chex.assert_trees_all_equal(resumed.state, whole.state)
 
 
-class Killed(BaseException):
-    """Stands for what ends a process without letting it save."""
-
-
-def raising(error):
-    def action():
-        raise error
-
-    return action
-
-
 def test_a_run_killed_between_checkpoints_equals_one_that_was_not(
     finished, env, tmp_path, monkeypatch
 ):
@@ -180,17 +178,10 @@ def test_a_round_whose_records_cannot_be_written_ends_before_it(
     finished, env, tmp_path, monkeypatch
 ):
     directory, whole = finished
-    run, append = run_in(tmp_path, env), Replay.append
-    with monkeypatch.context() as patch:
-
-        def full(self, records):
-            if self.lengths[0, 0] == 42:
-                raise OSError("no space left")
-            append(self, records)
-
-        patch.setattr(Replay, "append", full)
-        with pytest.raises(OSError, match="no space left"):
-            run.train()
+    run = run_in(tmp_path, env)
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no space left"):
+        full_disk(patch, 42)
+        run.train()
     run.close()
     assert run.counters.updates == run.state.updates[0] == 8
     resumed, _ = trained(tmp_path, env, resume=True)
@@ -226,8 +217,7 @@ def test_a_member_that_turns_not_finite_is_frozen_and_the_other_goes_on(
 ):
     directory, whole = finished
     run = run_in(tmp_path, env)
-    poisoned = run.state.params["reward"]["out"]["bias"].at[1].set(jnp.nan)
-    run.state.params["reward"]["out"]["bias"] = poisoned
+    run.state.params["loss"]["shift"] = jnp.array([0.0, jnp.nan])
     assert run.train() == "finished"
     run.close()
     message = " ".join(capsys.readouterr().out.split())

@@ -17,8 +17,10 @@ from dreamer_jax.population import Member, Population, update_members
 from dreamer_jax.rollout import collect
 from dreamer_jax.training import Run
 from experiments.cli.main import main
-from over_devices import LAWS, TASKS, Inside, Small, config_with
+from over_devices import LAWS, TASKS, config_with
+from probes import Inside
 from runs import batch_for
+from small_agent import Small
 
 ROOT = Path(__file__).parent.parent
 

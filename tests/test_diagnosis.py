@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from dreamer_jax.agent import Agent
 from dreamer_jax.config import LearningConfig, preset
 from dreamer_jax.diagnosis import diagnose, discounted_returns, warnings
 from dreamer_jax.records import Records
+from runs import random_members
 
 CONFIG = preset("debug")
 AGENT = Agent(CONFIG, 2)
@@ -32,8 +32,8 @@ def records_of(members, tasks, seed=0):
 
 
 def params_of(members, **constant_outputs):
-    """Fresh parameters of each member, some of whose heads answer a number whatever they read."""
-    params = jax.jit(jax.vmap(AGENT.init_params))(jax.random.split(jax.random.key(0), members))
+    """Parameters of each member, some of whose heads answer a number whatever they read."""
+    params = random_members(AGENT, range(members))
     for name, value in constant_outputs.items():
         out = params[name]["out"]
         constant = {"kernel": 0 * out["kernel"], "bias": jnp.full_like(out["bias"], value)}

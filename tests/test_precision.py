@@ -14,8 +14,9 @@ from dreamer_jax.diagnosis import diagnose
 from dreamer_jax.population import init_members
 from dreamer_jax.rollout import collect
 from probes import Probe
+from runs import random_members
 
-A, STORED, UPDATES, SEEDS = 2, 10, 200, 3
+A, STORED, UPDATES, SEEDS = 2, 10, 100, 3
 CONFIG = preset("debug")
 B, L = CONFIG.learning.batch_size, CONFIG.learning.sequence_length
 LOSSES = ("image_loss", "reward_loss", "kl", "termination_loss", "actor_loss", "value_loss")
@@ -31,7 +32,7 @@ def stored_batches(agent):
     records = collect(
         agent,
         Probe(action_size=A),
-        jax.vmap(agent.init_params)(jax.random.split(jax.random.key(0), 1)),
+        random_members(agent, [0]),
         jnp.zeros(1, jnp.int32),
         jnp.zeros(1, jnp.int32),
         jnp.int32(0),
@@ -159,7 +160,7 @@ def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
     )
 
 
-def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_seeds():
+def test_after_100_updates_the_losses_are_those_of_float32_within_a_tenth_of_the_noise_of_seeds():
     batches = stored_batches(agent_of("float32"))
     starts = init_members(agent_of("float32"), jnp.arange(SEEDS))
 
@@ -183,9 +184,10 @@ def test_after_200_updates_the_losses_are_those_of_float32_within_the_noise_of_s
     # Other seeds in float32 say what noise is; in bfloat16 the first one is enough.
     exact, rounded = losses("float32", SEEDS), losses("bfloat16", 1)
     for name in LOSSES:
-        first, last = (exact[name][:, part].mean() for part in (slice(10), slice(-100, None)))
-        ends = exact[name][:, -100:].mean(1)
-        difference = abs(ends[0] - rounded[name][0, -100:].mean())
-        assert difference < ends.std(ddof=1), name
+        first, last = (exact[name][:, part].mean() for part in (slice(10), slice(-50, None)))
+        ends = exact[name][:, -50:].mean(1)
+        difference = abs(ends[0] - rounded[name][0, -50:].mean())
+        # A hundredth at most; from a tenth on where parameters are rounded to bfloat16 too.
+        assert difference < 0.1 * ends.std(ddof=1), name
         if name in ("image_loss", "reward_loss", "termination_loss"):
-            assert last < 0.8 * first, f"{name} was learned"
+            assert last < 0.9 * first, f"{name} was learned"

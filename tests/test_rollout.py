@@ -1,5 +1,7 @@
 """Phases: records, keys and episodes."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,16 +14,19 @@ from dreamer_jax.randomness import Purpose, phase_key
 from dreamer_jax.records import Records
 from dreamer_jax.rollout import collect, episodes, rollout
 from probes import Probe
+from runs import random_members
 
 T = 30
+ENV = Probe()
 
 
 def random_policy(carry, image, first, key):
     return jax.random.uniform(key, (2,), minval=-1, maxval=1), carry
 
 
-def run(slot=0, seed=0):
-    records = rollout(Probe(), random_policy, (), jnp.int32(slot), jax.random.key(seed), T)
+@functools.cache
+def run():
+    records = rollout(ENV, random_policy, (), jnp.int32(0), jax.random.key(0), T)
     return jax.tree.map(np.asarray, records)
 
 
@@ -117,11 +122,10 @@ def test_keys_of_phases_differ_by_member_task_mode_and_phase():
 
 def collected(seeds, mode="random", phase=0, tasks=2):
     agent = Agent(preset("debug"), 2)
+    params = random_members(agent, seeds)
     seeds = jnp.array(seeds, jnp.int32)
-    params = jax.jit(jax.vmap(agent.init_params))(jax.vmap(jax.random.key)(seeds))
-    env = Probe()
     records = collect(
-        agent, env, params, seeds, seeds * 0, jnp.int32(phase), tasks=tasks, ticks=T, mode=mode
+        agent, ENV, params, seeds, seeds * 0, jnp.int32(phase), tasks=tasks, ticks=T, mode=mode
     )
     return jax.tree.map(np.asarray, records)
 
@@ -142,7 +146,7 @@ def test_a_policy_collects_the_same_again_and_other_things_in_another_phase():
 
 def test_modes_act_differently_in_one_compiled_program():
     agent, env, seeds = Agent(preset("debug"), 2), Probe(), jnp.zeros(1, jnp.int32)
-    params = jax.vmap(agent.init_params)(jax.random.split(jax.random.key(0), 1))
+    params = random_members(agent, [0])
     before = rollouts._collect._cache_size()
     actions = [
         collect(
