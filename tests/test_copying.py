@@ -1,9 +1,11 @@
 """Fine-tuning and frozen sources: what of a source is taken over, and what of it trains."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dreamer_jax.population import init_members
 from experiments.runs.agents import make_agent
 from experiments.runs.start import load_sources, transferred_members
 from runs import batch_for, spec_of, write_run
@@ -33,10 +35,21 @@ def test_everything_is_copied_where_shapes_fit(sources, method, source, fresh):
     read = load_sources(spec)
     state, report = transferred_members(spec, read)
     given = bits(read.agents[0].params)
+    from_scratch = make_agent(spec_of("hopper")).on_any_schedule()
+    drawn = init_members(from_scratch, jnp.array(spec.seeds)).params
     for place in range(2):
-        target = bits(member(state.params, place))
+        target, scratch = bits(member(state.params, place)), bits(member(drawn, place))
         assert {path for path in target if target[path] != given[path]} == fresh
+        assert all(target[path] == scratch[path] for path in fresh)
     assert {row.leaf for row in report.rows if row.operation == "keep"} == fresh
+
+
+def test_methods_share_the_program_that_draws_fresh_agents(sources):
+    init_members.clear_cache()
+    for method in ("fine-tuning", "frozen-source"):
+        spec = spec_of("hopper", method=method, sources=(sources / "same",), seeds=(3, 4))
+        transferred_members(spec, load_sources(spec))
+    assert init_members._cache_size() == 1
 
 
 def test_the_baseline_of_fine_tuning_is_from_scratch(sources):

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 
 import envs
 import transfer
+from dreamer_jax.agent import Agent
 from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.learning import AgentState
+from dreamer_jax.population import init_members
 from experiments.methods import Sources
 from experiments.runs.agents import check_source, load_source, make_agent
 from experiments.runs.latents import own_latents
@@ -88,8 +90,7 @@ def transferred_members(
     def chosen(first, one, other):
         return jax.tree.map(lambda x, y: jnp.where(first, x, y), one, other)
 
-    def start(seeds, is_target, own, theirs, parameters, shared):
-        fresh = jax.vmap(agent.init)(seeds).params
+    def start(fresh, seeds, is_target, own, theirs, parameters, shared):
         knowledge = {**shared, **theirs} if theirs else shared
         if own is not None:
             knowledge = jax.tree.map(lambda x: x[own], knowledge)
@@ -100,15 +101,26 @@ def transferred_members(
             targets = jax.vmap(chosen)(is_target, targets, fresh)
         return jax.vmap(agent.start)(targets, seeds), report
 
-    seeds = jnp.array([member.seed for member in spec.members], jnp.int32)
+    seeds = placement.spread(jnp.array([member.seed for member in spec.members], jnp.int32))
     of_members = (
-        seeds,
         jnp.arange(members) < count,
         *jax.tree.map(for_all, (own, theirs, parameters)),
     )
-    made = jax.jit(placement.over_devices(start, (0, 0, 0, 0, 0, None)))
-    state, report = placement.own(made(*placement.spread(of_members), shared))
+    over = placement.over_devices
+    # The draws compile longest by far: a program of their own, which all plans of an agent share.
+    draw = over(functools.partial(init_members, _untouched(agent)), axes=(0,))
+    made = jax.jit(over(start, (0, 0, 0, 0, 0, 0, None)), donate_argnums=0)
+    state, report = placement.own(
+        made(draw(seeds).params, seeds, *placement.spread(of_members), shared)
+    )
     # It is of the targets alone.
     report = jax.tree.map(lambda x: x[:count], report)
     rows = tuple(row._replace(shape=(count, *row.shape[1:])) for row in report.rows)
     return state, dataclasses.replace(report, rows=rows)
+
+
+def _untouched(agent: Agent) -> Agent:
+    """The agent of which no method has frozen anything: what its initial parameters depend on."""
+    agent = agent.on_any_schedule()
+    learning = dataclasses.replace(agent.config.learning, frozen=())
+    return dataclasses.replace(agent, config=dataclasses.replace(agent.config, learning=learning))
