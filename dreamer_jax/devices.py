@@ -9,9 +9,9 @@ Axis letters: P population member, D device.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -121,7 +121,11 @@ class Placement:
         return jax.device_put(np.arange(self.padded, dtype=np.int32), self.sharding())
 
     def over_devices(
-        self, function: Callable, axes: Sequence[int | None], donate: Sequence[int] = ()
+        self,
+        function: Callable,
+        axes: Sequence[int | None],
+        donate: Sequence[int] = (),
+        compiler_options: Mapping[str, Any] | None = None,
     ) -> Callable:
         """A function of members as one of all members, each device doing its own.
 
@@ -129,6 +133,7 @@ class Placement:
           function: of trees of any number of members; its results have them along axis 0.
           axes: for each argument the axis of members; None for what is the same for all.
           donate: the arguments whose memory is reused.
+          compiler_options: of the jitted function.
 
         Returns:
           The function itself on one device; else a jitted one.
@@ -143,7 +148,8 @@ class Placement:
             out_specs=_divided(0),
             check_vma=False,
         )
-        return jax.jit(mapped, donate_argnums=tuple(donate))
+        options = None if compiler_options is None else dict(compiler_options)
+        return jax.jit(mapped, donate_argnums=tuple(donate), compiler_options=options)
 
     def __str__(self) -> str:
         devices = f"{self.count} device{'s' if self.count > 1 else ''}"

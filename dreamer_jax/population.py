@@ -5,7 +5,7 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -101,10 +101,33 @@ def copied(tree):
     return jax.tree.map(jnp.copy, tree)
 
 
-@functools.partial(jax.jit, static_argnames="agent")
 def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
     """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
+    return init_program()(agent, seeds)
+
+
+def init_over(agent: Agent, placement: Placement) -> Callable[[jax.Array], AgentState]:
+    """`init_members` of one agent's functions, each device making its own members."""
+    if placement.mesh is None:
+        return functools.partial(init_members, agent)
+    fresh = functools.partial(_fresh_members, agent)
+    return placement.over_devices(fresh, axes=(0,), compiler_options=_of_one_use())
+
+
+def _fresh_members(agent: Agent, seeds: jax.Array) -> AgentState:
     return jax.vmap(agent.init)(seeds)
+
+
+@functools.cache
+def init_program():
+    """The jitted function of `init_members`, which is one for all callers."""
+    return jax.jit(_fresh_members, static_argnames="agent", compiler_options=_of_one_use())
+
+
+def _of_one_use() -> dict[str, int] | None:
+    """How a program is compiled that runs once: a CPU's code of draws takes half a minute to
+    optimise, and without that a tenth of a second to run."""
+    return {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
 
 
 def batch_shapes(agent: Agent, batch_size: int, length: int) -> Records:
@@ -184,7 +207,7 @@ class Population:
         self.own_seeds = list(own_seeds)
         self.seeds = placement.spread(jnp.array(self.own_seeds, jnp.int32))
         over = placement.over_devices
-        self._init = over(functools.partial(init_members, self._agent), axes=(0,))
+        self._init = init_over(self._agent, placement)
         self._update = over(self._update_members, axes=(0, 0, 0), donate=(0, 1))
         self._collect = over(self._collect_members, axes=(0, 0, 0, None, None, 0))
         self._diagnose = over(functools.partial(diagnose, self._agent), axes=(0, 0, 0, None))

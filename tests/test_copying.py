@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer_jax.population import init_members
+from dreamer_jax.population import init_members, init_program
 from experiments.runs.agents import make_agent
 from experiments.runs.start import load_sources, transferred_members
 from runs import batch_for, spec_of, write_run
@@ -45,11 +45,11 @@ def test_everything_is_copied_where_shapes_fit(sources, method, source, fresh):
 
 
 def test_methods_share_the_program_that_draws_fresh_agents(sources):
-    init_members.clear_cache()
+    init_program().clear_cache()
     for method in ("fine-tuning", "frozen-source"):
         spec = spec_of("hopper", method=method, sources=(sources / "same",), seeds=(3, 4))
         transferred_members(spec, load_sources(spec))
-    assert init_members._cache_size() == 1
+    assert init_program()._cache_size() == 1
 
 
 def test_the_baseline_of_fine_tuning_is_from_scratch(sources):

@@ -15,7 +15,7 @@ import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.learning import AgentState
-from dreamer_jax.population import init_members
+from dreamer_jax.population import init_over
 from experiments.methods import Sources
 from experiments.runs.agents import check_source, load_source, make_agent
 from experiments.runs.latents import own_latents
@@ -108,7 +108,7 @@ def transferred_members(
     )
     over = placement.over_devices
     # The draws compile longest by far: a program of their own, which all plans of an agent share.
-    draw = over(functools.partial(init_members, _untouched(agent)), axes=(0,))
+    draw = init_over(_untouched(agent), placement)
     made = jax.jit(over(start, (0, 0, 0, 0, 0, 0, None)), donate_argnums=0)
     state, report = placement.own(
         made(draw(seeds).params, seeds, *placement.spread(of_members), shared)
