@@ -304,11 +304,11 @@ def _presets() -> dict[str, Config]:
             exploration=explores,
             schedule=ScheduleConfig(
                 supersample=4,
-                environment_steps=8000,
+                environment_steps=6000,
                 prefill_phases=3,
                 updates_per_phase=100,
                 evaluate_every=1000,
-                checkpoint_every=4000,
+                checkpoint_every=3000,
             ),
         ),
         "debug": Config(

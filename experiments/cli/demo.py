@@ -26,7 +26,7 @@ class Demo:
 
     results: Path = Path("results")
     """The folder of all results; the demo's are in one of its preset's name."""
-    source: str = "zoo:brax-inverted_pendulum"
+    source: str = "zoo:brax-inverted_pendulum-balanced"
     """The agent to transfer from: zoo:NAME, a .safetensors file, or a results folder."""
     task: str = "bullet/inverted_pendulum"
     """The target."""
