@@ -53,7 +53,7 @@ STOPPABLE = trap : INT; run() { echo "$$*"; "$$@" || { code=$$?; test $$code = 1
 
 setup: $(STAMP)bullet+brax+gymnasium+dev$(ON)  ## Set up .venv with everything
 
-demo: $(STAMP)bullet+brax$(ON)  ## From a trained agent to fifteen that begin: what a transfer does (15 minutes)
+demo: $(STAMP)bullet+brax$(ON)  ## From a trained agent to fifteen that begin: what a transfer does (10 minutes)
 	@$(STOPPABLE) $(RUN) -m experiments demo --results $(RESULTS) $(ARGS)
 
 table-%: $(STAMP)$(BACKEND)$(ON)  ## Make Table N of the thesis from our runs: train what is missing, resume, show
