@@ -101,26 +101,30 @@ def copied(tree):
     return jax.tree.map(jnp.copy, tree)
 
 
-def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
-    """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
-    return init_program()(agent, seeds)
-
-
-def init_over(agent: Agent, placement: Placement) -> Callable[[jax.Array], AgentState]:
-    """`init_members` of one agent's functions, each device making its own members."""
-    if placement.mesh is None:
-        return functools.partial(init_members, agent)
-    fresh = functools.partial(_fresh_members, agent)
-    return placement.over_devices(fresh, axes=(0,), compiler_options=_of_one_use())
-
-
 def _fresh_members(agent: Agent, seeds: jax.Array) -> AgentState:
     return jax.vmap(agent.init)(seeds)
 
 
+@functools.partial(jax.jit, static_argnames="agent")
+def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
+    """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
+    return _fresh_members(agent, seeds)
+
+
+def init_over(agent: Agent, placement: Placement) -> Callable[[jax.Array], AgentState]:
+    """`init_members` of one agent's functions, each device making its own members.
+
+    It is compiled quickly, and so no part of another program (JAX allows no options there).
+    """
+    if placement.mesh is None:
+        return functools.partial(init_program(), agent)
+    fresh = functools.partial(init_members, agent)
+    return placement.over_devices(fresh, axes=(0,), compiler_options=_of_one_use())
+
+
 @functools.cache
 def init_program():
-    """The jitted function of `init_members`, which is one for all callers."""
+    """`init_members`, compiled quickly: one function for all that call it."""
     return jax.jit(_fresh_members, static_argnames="agent", compiler_options=_of_one_use())
 
 

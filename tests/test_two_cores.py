@@ -11,7 +11,7 @@ import pytest
 
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
-from dreamer_jax.population import init_program
+from dreamer_jax.population import init_members
 
 ROOT = Path(__file__).parent.parent
 
@@ -29,7 +29,7 @@ agent = Agent(preset("debug"), actions)
 # Compiled quickly. Not by an environment variable: there is none that a user must know.
 quick = {"xla_backend_optimization_level": 0}
 seeds = jnp.arange(members)
-state = init_members(agent, seeds)
+state = init_members.lower(agent, seeds).compile(quick)(seeds)
 shape = (members, batch, length)
 batches = Records(
     np.zeros((*shape, size, size, 3), np.uint8),
@@ -65,7 +65,7 @@ def test_a_population_starts_and_updates_whatever_the_environment_variables():
 def test_nothing_that_starts_a_population_calls_lapack():
     # Its calls side by side are what hung.
     agent = Agent(preset("debug"), 2)
-    program = init_program().lower(agent, jnp.arange(3)).as_text()
+    program = init_members.lower(agent, jnp.arange(3)).as_text()
     assert "stablehlo.dot" in program
     assert "lapack" not in program.lower()
     assert "lapack" in jax.jit(jnp.linalg.qr).lower(jnp.eye(3)).as_text().lower()
