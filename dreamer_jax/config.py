@@ -285,6 +285,11 @@ def _presets() -> dict[str, Config]:
         deterministic_size=8,
         hidden_size=8,
         head_units=8,
+        # Layers that are alike add nothing but time to compile them.
+        reward_layers=1,
+        value_layers=1,
+        actor_layers=1,
+        termination_layers=1,
     )
     return {
         "thesis": Config(),
