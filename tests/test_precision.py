@@ -47,7 +47,7 @@ def stored_batches():
             column += round(4 * records.action[step, 0])
             fallen = abs(column - size // 2) > 6
             records.terminal[step] = fallen
-            records.reward[step] = 1 - 4 * (records.action[step, 0] - 0.5) ** 2
+            records.reward[step] = 1 - (records.action[step, 0] - 0.5) ** 2
         records.image[step, :, column] = 255
     return records.map(lambda x: x.reshape(STORED, B, L, *x.shape[1:]))
 
