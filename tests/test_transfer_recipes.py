@@ -27,8 +27,18 @@ AGENTS = {
 }
 
 
+THESIS_LAYERS = {
+    "image_size": 64,
+    "reward_layers": 2,
+    "value_layers": 3,
+    "actor_layers": 4,
+    "termination_layers": 3,
+}
+
+
 def agent_tree(**settings):
-    """The shapes of a real agent's parameters, with meta-models of the components in `meta`."""
+    """The shapes of a real agent's parameters, with meta-models of the components in `meta`; of as
+    many layers as the thesis's agents have, whatever the preset."""
     return jax.tree.map(lambda x: x, _shapes(**settings))
 
 
@@ -36,7 +46,7 @@ def agent_tree(**settings):
 def _shapes(preset="debug", action_size=3, discrete=False, meta=(), samples=0, **network):
     chosen = config.preset(preset)
     chosen = dataclasses.replace(
-        chosen, network=dataclasses.replace(chosen.network, **{"image_size": 64} | network)
+        chosen, network=dataclasses.replace(chosen.network, **THESIS_LAYERS | network)
     )
     agent = Agent(chosen, action_size, discrete)
     modules = {
