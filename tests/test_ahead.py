@@ -32,7 +32,8 @@ UPDATES = {"files": (population, "update_members"), "device": (device_round, "st
 
 def agent_with(replay, collect="beside"):
     config = preset("debug")
-    settings = {"environment_steps": 200, "replay": replay, "collect": collect}
+    settings = {"environment_steps": 200, "checkpoint_every": 80}
+    settings |= {"replay": replay, "collect": collect}
     schedule = dataclasses.replace(config.schedule, **settings)
     return Small(dataclasses.replace(config, schedule=schedule), 2)
 
