@@ -11,6 +11,7 @@ Parameters are one dict whose names read like the thesis:
 """
 
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -111,6 +112,11 @@ class Model:
             for name, (outputs, layers) in sizes.items()
         }
         return usual | {name: module for name, module in self.modules if name in usual}
+
+    def parameter_shapes(self) -> Params:
+        """The shapes of `init_params`, `jax.ShapeDtypeStruct`; traced once for equal networks."""
+        plain = dataclasses.replace(self, config=Config(network=self.config.network))
+        return jax.tree.map(lambda x: x, _parameter_shapes(plain))
 
     def init_params(self, key: jax.Array) -> Params:
         """Fresh parameters, float32."""
@@ -216,3 +222,8 @@ class Model:
         truth = normalise_image(batch.image)
         model = self.decode(params, features)
         return truth + 0.5, jnp.clip(model + 0.5, 0.0, 1.0)
+
+
+@functools.cache
+def _parameter_shapes(model: Model) -> Params:
+    return jax.eval_shape(model.init_params, jax.random.key(0))

@@ -1,7 +1,6 @@
 """Results folders made in a moment: a run as its spec says, of agents that have not trained."""
 
 import dataclasses
-import functools
 import json
 
 import jax
@@ -29,16 +28,10 @@ def spec_of(*tasks, seeds=(0,), config=CONFIG, method=None, **settings) -> RunSp
     return RunSpec(names, seeds, config, methods.make(method, settings))
 
 
-@functools.cache
-def shapes_of(agent):
-    """Of an agent's parameters."""
-    return jax.eval_shape(agent.init_params, jax.random.key(0))
-
-
 def random_params(agent, seed=0):
     """Parameters of the shapes of an agent's, without compiling its initialisation."""
-    random = np.random.default_rng(seed)
-    return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes_of(agent))
+    random, shapes = np.random.default_rng(seed), agent.parameter_shapes()
+    return jax.tree.map(lambda x: random.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
 
 
 def random_members(agent, seeds):

@@ -383,14 +383,15 @@ def test_imagination_weighs_what_follows_by_the_termination_head():
 @pytest.fixture(scope="module")
 def with_choices():
     """An agent of three choices that predicts terminations and is paid for entropy, what it has
-    become by 150 updates on a batch that is all terminal, and their metrics."""
-    config = with_settings("learning", entropy_scale=100.0, actor_learning_rate=3e-3)
+    become by 60 updates on a batch that is all terminal, and their metrics."""
+    rates = {"actor_learning_rate": 1e-2, "model_learning_rate": 5e-3}
+    config = with_settings("learning", entropy_scale=100.0, **rates)
     network = dataclasses.replace(config.network, termination=True)
     agent = Agent(dataclasses.replace(config, network=network), 3, discrete=True)
     state, update, history = agent.start(random_params(agent), 0), jax.jit(agent.update), []
     choices = np.eye(3, dtype=np.float32)[np.zeros((B, L), int)]
     batch = batch_of()._replace(action=choices, terminal=np.ones((B, L), bool))
-    for _ in range(150):
+    for _ in range(60):
         state, metrics = update(state, batch)
         history.append(metrics)
     return agent, state.params, batch, jax.tree.map(lambda *x: np.array(x), *history)
@@ -401,8 +402,8 @@ def test_a_termination_head_learns_the_discount(with_choices):
     # Every record is terminal, so the learned discount falls towards zero.
     posterior, _, _ = jax.jit(agent.observe)(params, batch, jax.random.key(0))
     discount = jax.nn.sigmoid(agent.head(params, "termination", posterior.features))
-    assert discount.mean() < 0.35
-    assert metrics["termination_loss"][-1] < 0.7
+    assert discount.mean() < 0.2
+    assert metrics["termination_loss"][-1] < 0.3
 
 
 def test_discrete_actions_are_one_hot_and_their_actor_learns(with_choices):
@@ -432,10 +433,10 @@ def test_entropys_weight_pulls_an_actor_towards_even_odds(with_choices):
 def test_entropys_weight_spreads_continuous_actions_over_their_range(state):
     # A squashed Gaussian comes nearest to the uniform distribution, whose entropy is log 2 for
     # each of the A actions, at a spread of about 0.9.
-    agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=1e-2), A)
+    agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=3e-2), A)
     state, batch, update = agent.start(state.params, 0), batch_of(), jax.jit(agent.update)
     history = []
-    for _ in range(150):
+    for _ in range(80):
         state, metrics = update(state, batch)
         history.append((metrics["actor_entropy"], metrics["actor_std"]))
     (entropy, std), (last_entropy, last_std) = history[0], history[-1]

@@ -11,7 +11,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import transfer
-from compilation import QUICK_CODE
 from dreamer_jax import rssm
 from dreamer_jax.networks import Head
 from experiments.methods.meta import MetaModel
@@ -225,16 +224,19 @@ def test_targets_with_two_three_and_four_sources_are_one_population(folder):
 
 
 def test_exactly_what_is_frozen_does_not_move_by_a_bit_in_a_thousand_updates(folder, monkeypatch):
+    # Small batches, for there are many.
+    sizes = {"batch_size": 1, "sequence_length": 2, "horizon": 2}
+    config = dataclasses.replace(CONFIG, learning=dataclasses.replace(CONFIG.learning, **sizes))
     spec = meta_spec(
         folder, "hopper", "ant", suffix="_frozen", dynamics="frozen", meta=("reward", "value"),
-        switching=True,
+        switching=True, config=config,
     )  # fmt: skip
     monkeypatch.setattr(MetaModel, "known_tasks", lambda *_: classifier_of(0.5))
     agent, sources = make_agent(spec), load_sources(spec)
     state, report = transferred_members(spec, sources)
     start, batch = member(state, 0), batch_for(agent)
 
-    @functools.partial(jax.jit, compiler_options=QUICK_CODE)
+    @jax.jit
     def train(state):
         return jax.lax.fori_loop(0, 1000, lambda _, state: agent.update(state, batch)[0], state)
 

@@ -64,9 +64,7 @@ class FractionalTransfer(Targets):
 
     def knowledge(self, agent, seeds, sources, sample):
         """Each target's source and fraction."""
-        import jax
-
-        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
+        fresh = agent.parameter_shapes()
         omegas = [values["omega"] for values in self.targets(seeds)]
         return self.from_sources(self.plan(), seeds, sources, fresh, omega=omegas)
 

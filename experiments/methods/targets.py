@@ -150,8 +150,6 @@ class CopiedTargets(Targets):
 
     def knowledge(self, agent, seeds, sources, sample):
         """Each target's source, as far as it fits."""
-        import jax
-
-        fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
+        fresh = agent.parameter_shapes()
         plan = self.plan(self.unfit(fresh, sources))
         return self.from_sources(plan, seeds, sources, fresh)

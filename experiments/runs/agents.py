@@ -29,7 +29,7 @@ def make_agent(spec: RunSpec) -> Agent:
         agent = dataclasses.replace(agent, modules=modules)
     if (chosen := spec.method.plan()) is None:
         return agent
-    fresh = jax.eval_shape(agent.init_params, jax.random.key(0))
+    fresh = agent.parameter_shapes()
     kept = [path for path, rule in transfer.claims(chosen, fresh).items() if rule.frozen]
     learning = spec.config.learning
     learning = dataclasses.replace(learning, frozen=(*learning.frozen, *kept))

@@ -41,7 +41,7 @@ def load_sources(spec: RunSpec, base: str | Path = "", *, accept_failed: bool = 
     for one in (*agents, *stored):
         check_source(one, spec)
     sources = Sources(agents, stored)
-    fresh = jax.eval_shape(make_agent(spec).init_params, jax.random.key(0))
+    fresh = make_agent(spec).parameter_shapes()
     method.check_sources(sources, fresh)
     return sources
 
