@@ -5,7 +5,7 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -119,7 +119,11 @@ def init_program():
 
     It is no part of another program, for JAX allows no options of compilation there.
     """
-    return jax.jit(Agent.init, static_argnums=0, compiler_options=_of_one_use())
+    return jax.jit(_fresh, static_argnames="agent", compiler_options=_of_one_use())
+
+
+def _fresh(agent: Agent, seed: jax.Array) -> AgentState:
+    return agent.init(seed)
 
 
 def _of_one_use() -> dict[str, int] | None:
@@ -213,8 +217,7 @@ class Population:
     def fresh(self) -> AgentState:
         """Fresh agents of the members' seeds: leaves [P, ...]."""
         fresh = init_members(self._agent, self.own_seeds)
-        # Copied, so that no leaf shares memory with NumPy: updates reuse theirs.
-        return self.put(fresh if self._placement.mesh else jax.tree.map(jnp.array, fresh))
+        return self.put(fresh if self._placement.mesh else jax.device_put(fresh))
 
     def shapes(self) -> AgentState:
         """Their shapes, `jax.ShapeDtypeStruct` [P with padding, ...]."""

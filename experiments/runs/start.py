@@ -111,9 +111,7 @@ def transferred_members(
     # The draws compile longest by far: a program of their own, which all plans of an agent share.
     fresh = init_members(_untouched(agent), own_seeds).params
     made = jax.jit(over(start, (0, 0, 0, 0, 0, 0, None)), donate_argnums=0)
-    state, report = placement.own(
-        made(*placement.spread((fresh, own_seeds, *of_members)), shared)
-    )
+    state, report = placement.own(made(*placement.spread((fresh, own_seeds, *of_members)), shared))
     # It is of the targets alone.
     report = jax.tree.map(lambda x: x[:count], report)
     rows = tuple(row._replace(shape=(count, *row.shape[1:])) for row in report.rows)
