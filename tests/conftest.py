@@ -14,6 +14,9 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # What tests compile runs for milliseconds: quick compilation matters more than quick code.
 _flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
+# A sixth of what is left are passes over loops, each of which is run thirteen times.
+_passes = "simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking"
+_flags += [f"--xla_disable_hlo_passes={_passes}"]
 # Later versions do not know the first of these flags, and end the process that sets it.
 if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
     # In one part, since there is a core for each process of tests, and less to do in all.
