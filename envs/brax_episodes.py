@@ -8,11 +8,13 @@ generalized engine is thousands of operations, and to compile them takes longer 
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.brax_chain import Chain
 from envs.brax_forces import Forces
@@ -20,7 +22,8 @@ from envs.brax_physics import Physics, brax_state, quiet
 
 # isort: split
 # After the module above, which keeps what Brax says on import to itself.
-from brax.base import Transform
+from brax.base import Motion, Transform
+from brax.generalized.base import State
 
 
 class Episodes:
@@ -95,8 +98,11 @@ class GeneralizedEpisodes(Episodes):
         self._env = physics.env
         self._chain = Chain(physics.env.sys)
         self._forces = Forces(physics.env.sys, self._chain)
-        empty = jax.eval_shape(physics.start, jax.random.key(0))
-        self._empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
+        system = physics.env.sys
+        links = (system.num_links(),)
+        nothing = np.zeros(system.q_size(), np.float32), np.zeros(system.qd_size(), np.float32)
+        # What a step of Brax's would find beside this is not read, and takes a second to trace.
+        self._empty = State.init(*nothing, Transform.zero(links), Motion.zero(links))
 
     def begin(self, keys: jax.Array) -> _Held:
         drawn = jax.vmap(self._drawn)(keys)
@@ -176,8 +182,12 @@ class GeneralizedEpisodes(Episodes):
         return self._physics.judged(before, env.step(brax_state(before), action))
 
 
+@functools.cache
 def episodes_of(physics: Physics, repeat: int) -> Episodes:
-    """The episodes of a task's physics, the quickest to compile that there are for its engine."""
+    """The episodes of a task's physics, the quickest to compile that there are for its engine.
+
+    The same ones for all who ask for them: they take a while to make.
+    """
     kind = GeneralizedEpisodes if physics.backend == "generalized" else Episodes
     return kind(physics, repeat)
 

@@ -83,6 +83,32 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def hosted_slots(tasks: Sequence[TaskSpec], workers: int, share: int) -> list[list[int]]:
+    """Which slots each worker process hosts, so that none is without any.
+
+    Args:
+      tasks: the task of each slot.
+      workers: at most how many processes there are.
+      share: how many slots each thread asks for, see `SimulatorPool`.
+    """
+    slots = range(len(tasks))
+    count = min(workers, len(tasks))
+    groups = _groups(len(tasks), workers, share)
+    hosted = []
+    for group in range(groups):
+        # Slots of one task go to different workers, for tasks differ in cost.
+        chosen = [slot for slot in slots if slot // share % groups == group]
+        by_task = sorted(chosen, key=lambda slot: tasks[slot].name)
+        own = min(len(range(group, count, groups)), len(chosen))
+        hosted += [sorted(by_task[first::own]) for first in range(own)]
+    return hosted
+
+
+def _groups(slots: int, workers: int, share: int) -> int:
+    """How many groups of workers serve the threads that ask for `share` slots each."""
+    return min(-(-slots // share), workers, slots)
+
+
 class SimulatorPool:
     """One simulator per slot, in worker processes that each host a share of the slots.
 
@@ -116,20 +142,12 @@ class SimulatorPool:
         self._timeout, self._hurried = timeout, False
         self.tasks = tuple(tasks)
         slots = len(self.tasks)
-        count = min(workers or available_cores(), slots)
         self._share = share or slots
-        groups = min(-(-slots // self._share), count)
+        hosting = hosted_slots(self.tasks, workers or available_cores(), self._share)
+        groups = _groups(slots, workers or available_cores(), self._share)
         self._locks = [threading.Lock() for _ in range(groups)]
-        self._worker_of: dict[int, int] = {}
-        first = 0
-        for group in range(groups):
-            chosen = [slot for slot in range(slots) if self._group(slot) == group]
-            own = min(len(range(group, count, groups)), len(chosen))
-            # Slots of one task go to different workers, for tasks differ in cost.
-            by_task = sorted(chosen, key=lambda slot: self.tasks[slot].name)
-            self._worker_of |= {slot: first + i % own for i, slot in enumerate(by_task)}
-            first += own
-        count = first
+        self._worker_of = {slot: index for index, own in enumerate(hosting) for slot in own}
+        count = len(hosting)
 
         # With a core to spare, the pool waits awake, as its workers do; several threads would keep
         # one another from it.
@@ -142,8 +160,8 @@ class SimulatorPool:
         with _shared_file(slots * layout.itemsize) as file:
             memory = mmap.mmap(file.fileno(), slots * layout.itemsize)
             self._records = np.ndarray((slots,), layout, buffer=memory)
-            for index in range(count):
-                hosted = {s: self.tasks[s] for s in range(slots) if self._worker_of[s] == index}
+            for own in hosting:
+                hosted = {slot: self.tasks[slot] for slot in own}
                 self._workers.append(_start(hosted, file.fileno()))
                 # One that is dead already is noticed when its reply is waited for.
                 with suppress(ConnectionError):

@@ -114,7 +114,10 @@ def mapped_rows(function: Callable[[jax.Array], Any]) -> Callable[[jax.Array], A
     @custom_vmap
     def call(row):
         lead = row.shape[:-1]
-        results = function(row.reshape(math.prod(lead), row.shape[-1]))
+        # JAX traces what is mapped with no mesh or with an empty one, which is the same; said in
+        # one way, so that the jitted functions within are not traced once for each.
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            results = function(row.reshape(math.prod(lead), row.shape[-1]))
         return jax.tree.map(lambda x: x.reshape((*lead, *x.shape[1:])), results)
 
     @call.def_vmap

@@ -5,6 +5,8 @@ import os
 from importlib.metadata import version
 from pathlib import Path
 
+import pytest
+
 # Compiled functions are kept on disk, so that tests and their subprocesses share them.
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
@@ -68,3 +70,14 @@ def pytest_collection_finish():
     gc.freeze()
     # Programs are traced in millions of objects, few of them garbage.
     gc.set_threshold(50_000, 20, 50)
+
+
+@pytest.fixture(scope="module")
+def small_agents_are_diagnosed():
+    """Runs diagnose agents of one number (small_agent.py), which have no networks to ask."""
+    from dreamer_jax import population
+    from small_agent import diagnose
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(population, "diagnose", diagnose)
+        yield

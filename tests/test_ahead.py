@@ -21,7 +21,9 @@ from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Member, Population
 from dreamer_jax.training import Run
 from probes import Inside, Probe
-from small_agent import Small, diagnose
+from small_agent import Small
+
+pytestmark = pytest.mark.usefixtures("small_agents_are_diagnosed")
 
 ENV = Probe()
 MEMBERS = (Member(0, "one"), Member(7, "two"))
@@ -30,7 +32,8 @@ UPDATES = {"files": (population, "update_members"), "device": (device_round, "st
 
 def agent_with(replay, collect="beside"):
     config = preset("debug")
-    settings = {"environment_steps": 200, "replay": replay, "collect": collect}
+    settings = {"environment_steps": 200, "checkpoint_every": 80}
+    settings |= {"replay": replay, "collect": collect}
     schedule = dataclasses.replace(config.schedule, **settings)
     return Small(dataclasses.replace(config, schedule=schedule), 2)
 
@@ -48,13 +51,6 @@ def trained(directory, agent, **options):
 
 def metrics(directory):
     return (directory / "metrics.jsonl").read_bytes()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def diagnosed():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(population, "diagnose", diagnose)
-        yield
 
 
 @pytest.fixture(scope="module", params=UPDATES)

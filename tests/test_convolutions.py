@@ -1,5 +1,7 @@
 """The two ways of computing the strided layers, against each other, flax and numbers by hand."""
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -38,25 +40,37 @@ def draw(batch, height, width, k, inputs, outputs, seed=0):
     x = rng.normal(size=(*batch, height, width, inputs))
     kernel = rng.normal(size=(k, k, inputs, outputs)) / (k * inputs**0.5)
     bias = rng.normal(size=outputs)
-    return tuple(jnp.asarray(each, jnp.float32) for each in (x, kernel, bias))
+    return tuple(np.asarray(each, np.float32) for each in (x, kernel, bias))
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1, 5))
 def value_and_gradients(layer, method, x, kernel, bias, relu=False):
     """The output, and the gradients of a loss that weighs every entry of it differently."""
 
     def loss(x, kernel, bias):
         out = layer(x, kernel, bias, relu=relu, method=method)
-        weights = jnp.cos(jnp.arange(out.size, dtype=jnp.float32)).reshape(out.shape)
+        weights = np.cos(np.arange(out.size, dtype=np.float32)).reshape(out.shape)
         return jnp.sum(weights * jnp.square(out)), out
 
-    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2), has_aux=True))
-    gradients, out = gradient(x, kernel, bias)
+    gradients, out = jax.grad(loss, argnums=(0, 1, 2), has_aux=True)(x, kernel, bias)
     return {"out": out, **dict(zip(("x", "kernel", "bias"), gradients, strict=True))}
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def both_methods(layer, relu, x, kernel, bias):
+    """What the two ways of computing a layer give, in one program."""
+    return tuple(value_and_gradients(layer, method, x, kernel, bias, relu) for method in METHODS)
+
+
+@functools.cache
+def jitted(layer):
+    return jax.jit(layer, static_argnames=("relu", "method"))
 
 
 def assert_same(actual, desired, tolerance=1e-5):
     """Compare relative to the largest entry, since sums may cancel."""
     assert actual.keys() == desired.keys()
+    actual, desired = (jax.tree.map(np.asarray, each) for each in (actual, desired))
     for name in desired:
         scale = np.abs(desired[name]).max()
         assert_allclose(actual[name], desired[name], atol=tolerance * scale, rtol=0, err_msg=name)
@@ -69,10 +83,8 @@ def assert_same(actual, desired, tolerance=1e-5):
 )
 def test_both_methods_agree_at_the_sizes_of_the_networks(layer, side, k, inputs, outputs):
     arguments = draw((2,), side, side, k, inputs, outputs)
-    assert_same(
-        value_and_gradients(layer, "matmul", *arguments),
-        value_and_gradients(layer, "library", *arguments),
-    )
+    library, matmul = both_methods(layer, False, *arguments)
+    assert_same(matmul, library)
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
@@ -90,10 +102,8 @@ def test_both_methods_agree_at_any_size(transposed, k, excess, batch, inputs, ou
     smallest = 1 if transposed else k
     height, width = (smallest + each for each in excess)
     arguments = draw(batch, height, width, k, inputs, outputs)
-    assert_same(
-        value_and_gradients(layer, "matmul", *arguments, relu),
-        value_and_gradients(layer, "library", *arguments, relu),
-    )
+    library, matmul = both_methods(layer, relu, *arguments)
+    assert_same(matmul, library)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -105,8 +115,8 @@ def test_a_layer_with_relu_is_the_layer_and_then_relu(layer, method):
         return jax.nn.relu(layer(*arguments, method=method))
 
     desired = value_and_gradients(relu_after, method, *arguments)
-    assert 0.2 < (desired["out"] == 0).mean() < 0.8
-    assert_same(value_and_gradients(layer, method, *arguments, relu=True), desired)
+    assert 0.2 < np.mean(desired["out"] == 0) < 0.8
+    assert_same(value_and_gradients(layer, method, *arguments, True), desired)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -117,25 +127,31 @@ def test_both_layers_are_those_of_flax(method, batch):
         (convolution, nn.Conv(5, (4, 4), strides=2, padding="VALID")),
         (transposed_convolution, nn.ConvTranspose(5, (4, 4), strides=(2, 2), padding="VALID")),
     ):
-        desired = module.apply({"params": {"kernel": kernel, "bias": bias}}, x)
-        actual = layer(x, kernel, bias, method=method)
+
+        @jax.jit
+        def both(x, kernel, bias, layer=layer, module=module):
+            params = {"kernel": kernel, "bias": bias}
+            return layer(x, kernel, bias, method=method), module.apply({"params": params}, x)
+
+        actual, desired = both(x, kernel, bias)
         assert actual.shape == desired.shape
         assert_allclose(actual, desired, atol=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_convolution_by_hand(method):
-    x = jnp.arange(1.0, 17.0).reshape(4, 4, 1)
-    kernel = jnp.array([[1.0, 2.0], [3.0, 4.0]]).reshape(2, 2, 1, 1)
-    out = convolution(x, kernel, jnp.array([0.5]), method=method)
+    x = np.arange(1, 17, dtype=np.float32).reshape(4, 4, 1)
+    kernel = np.float32([[1, 2], [3, 4]]).reshape(2, 2, 1, 1)
+    out = np.asarray(jitted(convolution)(x, kernel, np.float32([0.5]), method=method))
     assert_array_equal(out[..., 0], [[44.5, 64.5], [124.5, 144.5]])
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_transposed_convolution_by_hand(method):
-    x = jnp.array([1.0, 10.0]).reshape(2, 1, 1)
-    kernel = jnp.arange(1.0, 10.0).reshape(3, 3, 1, 1)
-    out = transposed_convolution(x, kernel, jnp.array([0.5]), method=method)
+    x = np.float32([1, 10]).reshape(2, 1, 1)
+    kernel = np.arange(1, 10, dtype=np.float32).reshape(3, 3, 1, 1)
+    layer = jitted(transposed_convolution)
+    out = np.asarray(layer(x, kernel, np.float32([0.5]), method=method))
     desired = np.array([[9, 8, 7], [6, 5, 4], [93, 82, 71], [60, 50, 40], [30, 20, 10]])
     assert_array_equal(out[..., 0], desired + 0.5)
 
@@ -144,12 +160,12 @@ def test_a_transposed_convolution_by_hand(method):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_population_may_have_a_kernel_for_each_member(layer, method):
     members = [draw((2,), 6, 5, 4, 3, 4, seed) for seed in range(3)]
-    stacked = [jnp.stack(leaves) for leaves in zip(*members, strict=True)]
+    stacked = [np.stack(leaves) for leaves in zip(*members, strict=True)]
 
     def evaluate(x, kernel, bias):
         return value_and_gradients(layer, method, x, kernel, bias)
 
-    population = jax.vmap(evaluate)(*stacked)
+    population = jax.tree.map(np.asarray, jax.jit(jax.vmap(evaluate))(*stacked))
     for index, member in enumerate(members):
         assert_same({k: v[index] for k, v in population.items()}, evaluate(*member))
 
@@ -157,8 +173,9 @@ def test_a_population_may_have_a_kernel_for_each_member(layer, method):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_members_may_share_images_but_not_kernels(layer):
     x, kernel, bias = draw((2,), 6, 5, 4, 3, 4)
-    kernels = jnp.stack([kernel, 2 * kernel])
-    outs = jax.vmap(lambda kernel: layer(x, kernel, bias, method="matmul"))(kernels)
+    kernels = np.stack([kernel, 2 * kernel])
+    mapped = jax.jit(jax.vmap(lambda kernel: layer(x, kernel, bias, method="matmul")))
+    outs = np.asarray(mapped(kernels))
     assert_allclose(outs[1] - bias, 2 * (outs[0] - bias), atol=1e-5)
 
 
@@ -166,9 +183,9 @@ def test_members_may_share_images_but_not_kernels(layer):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_bfloat16_inputs_give_bfloat16_outputs_and_gradients_summed_in_float32(layer, method):
     # Every output is a sum of C = 1024 ones or more, and bfloat16 cannot count past 256.
-    x = jnp.ones((2, 2, 1024), jnp.bfloat16)
-    kernel, bias = jnp.ones((2, 2, 1024, 1)), jnp.zeros(1)
-    out = layer(x, kernel, bias, method=method)
+    x = np.ones((2, 2, 1024), jnp.bfloat16)
+    kernel, bias = np.ones((2, 2, 1024, 1), np.float32), np.zeros(1, np.float32)
+    out = np.asarray(jitted(layer)(x, kernel, bias, method=method))
     assert out.dtype == jnp.bfloat16
     assert_array_equal(out, 4096 if layer is convolution else 1024)
 
@@ -185,7 +202,8 @@ def test_bfloat16_inputs_give_bfloat16_outputs_and_gradients_summed_in_float32(l
 def test_an_empty_batch_gives_an_empty_batch(layer, method):
     x, kernel, bias = draw((2, 0), 6, 6, 4, 3, 5)
     side = 2 if layer is convolution else 14
-    assert layer(x, kernel, bias, method=method).shape == (2, 0, side, side, 5)
+    out = jitted(layer)(x, kernel, bias, method=method)
+    assert out.shape == (2, 0, side, side, 5)
 
 
 def test_the_gradient_of_images_is_not_computed_unless_asked_for():

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from accidents import Killed, full_disk, in_call, raising
-from dreamer_jax import device_replay, device_round, population
+from dreamer_jax import device_replay, device_round
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.device_round import on_device, store_and_update, whole_round
@@ -26,7 +26,9 @@ from dreamer_jax.replay import Replay
 from dreamer_jax.schedule import Schedule
 from dreamer_jax.training import Run
 from probes import BrokenProbe, Inside, Probe
-from small_agent import Small, diagnose
+from small_agent import Small
+
+pytestmark = pytest.mark.usefixtures("small_agents_are_diagnosed")
 
 
 def config_with(**settings):
@@ -56,13 +58,6 @@ def trained(directory, env, **options):
 
 def metrics(directory):
     return (directory / "metrics.jsonl").read_bytes()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def diagnosed():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(population, "diagnose", diagnose)
-        yield
 
 
 @pytest.fixture(scope="module", params=ENVS, ids=lambda name: name.replace(" ", "_"))

@@ -104,14 +104,14 @@ def test_without_pybullet_making_a_task_says_what_to_install(tmp_path, monkeypat
 # Reproducible to the bit
 
 
-def phase_digests(pool: SimulatorPool, seed: int, ticks: int = 50) -> list[str]:
+def phase_digests(pool: SimulatorPool, seed: int, ticks: int = 24) -> list[str]:
     """For each slot, a digest of all that a phase of random actions gave."""
     slots = np.arange(len(pool.tasks))
     keys = np.full((len(slots), 2), seed, np.uint32)
     actions = np.random.default_rng(seed).uniform(-1, 1, (ticks, len(NAMES), 8))
     actions = actions.astype(np.float32)[:, slots % len(NAMES)]
     record = [pool.reset(slots, keys), *(pool.step(slots, action) for action in actions)]
-    assert sum(time_step.first for time_step in record).min() >= 4, "every simulator fell"
+    assert sum(time_step.first for time_step in record).min() >= 3, "every simulator fell twice"
     return [
         hashlib.sha256(
             b"".join(np.ascontiguousarray(leaf[slot]) for step in record for leaf in step)
@@ -322,11 +322,15 @@ def test_a_population_of_two_tasks_runs_under_jit_scan_and_nested_vmap():
 def test_no_time_limit_ends_a_phase():
     pytest.importorskip("envs.bullet")
     env = envs.make(["bullet/inverted_pendulum"], image_size=8)
-    state, _ = env.reset(jnp.int32(0), jax.random.key(0))
-    _, record = jax.jit(lambda s: jax.lax.scan(env.step, s, jnp.zeros((510, 1))))(state)
+
+    @jax.jit
+    def phase(key):
+        return jax.lax.scan(env.step, env.reset(0, key)[0], jnp.zeros((510, 1)))[1]
+
+    record = phase(jax.random.key(0))
     env.check()
     env.close()
-    assert not record.first.any() and not record.terminal.any()
+    assert not np.any(record.first) and not np.any(record.terminal)
 
 
 # Supersampling
@@ -348,11 +352,11 @@ def test_supersampled_pictures_are_the_means_of_larger_ones():
     for size, factor in ((128, 1), (32, 4)):
         env = envs.make(["bullet/inverted_pendulum"], image_size=size, supersample=factor)
         try:
-            _, start = jax.vmap(env.reset)(jnp.arange(1), jax.random.split(jax.random.key(0), 1))
+            _, start = jax.jit(env.reset)(0, jax.random.key(0))
             env.check()
         finally:
             env.close()
-        pictures[factor] = np.asarray(start.image[0])
+        pictures[factor] = np.asarray(start.image)
     assert pictures[4].shape == (32, 32, 3)
     np.testing.assert_array_equal(pictures[4], averaged(pictures[1], 4))
     assert len(np.unique(pictures[4])) > len(np.unique(averaged(pictures[1][::4, ::4], 1)))

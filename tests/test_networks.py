@@ -73,65 +73,81 @@ def test_the_decoder_undoes_the_encoder_in_shape(size, depth, embedding):
 
 
 def test_kernels_lie_in_the_range_of_glorot_and_fill_it():
-    kernel = networks.Dense(200).init(jax.random.key(0), jnp.zeros((1, 100)))["params"]["kernel"]
+    init = jax.jit(networks.Dense(200).init)
+    kernel = np.asarray(init(jax.random.key(0), np.zeros((1, 100)))["params"]["kernel"])
     limit = math.sqrt(6 / 300)
-    assert 0.98 * limit < jnp.abs(kernel).max() <= limit
+    assert 0.98 * limit < np.abs(kernel).max() <= limit
     assert_allclose(kernel.std(), limit / math.sqrt(3), rtol=0.02)
 
 
 def test_elu_is_that_of_jax_and_so_is_its_gradient():
-    x = jnp.array([-100.0, -3.0, -1e-3, 0.0, 1e-3, 2.0, 100.0])
-    assert_allclose(networks.elu(x), jax.nn.elu(x), atol=1e-7)
-    gradient, expected = (jax.vmap(jax.grad(f))(x) for f in (networks.elu, jax.nn.elu))
-    assert_allclose(gradient, expected, rtol=1e-6)
+    x = np.float32([-100.0, -3.0, -1e-3, 0.0, 1e-3, 2.0, 100.0])
+    (value, gradient), (expected, expected_gradient) = (
+        jax.jit(jax.vmap(jax.value_and_grad(f)))(x) for f in (networks.elu, jax.nn.elu)
+    )
+    assert_allclose(value, expected, atol=1e-7)
+    assert_allclose(gradient, expected_gradient, rtol=1e-6)
 
 
 def test_the_action_distribution_is_that_of_dreamer():
-    mean, std = networks.tanh_normal(jnp.array([[0.0, 100.0, 0.0, -2.0]]))
+    mean, std = jax.jit(networks.tanh_normal)(np.float32([[0.0, 100.0, 0.0, -2.0]]))
     assert_allclose(mean, [[0.0, 5.0]], rtol=1e-6)
     shift = math.log(math.exp(5) - 1)
     expected = [[5 + 1e-4, math.log1p(math.exp(shift - 2)) + 1e-4]]
     assert_allclose(std, expected, rtol=1e-5)
 
 
+log_probability = jax.jit(networks.tanh_normal_log_probability)
+
+
 def test_the_log_density_of_actions_integrates_to_one():
-    outputs = jnp.array([0.3, -5.2])
+    outputs = np.float32([0.3, -5.2])
     actions = np.linspace(-1, 1, 20_001)[1:-1]
-    log_density = networks.tanh_normal_log_probability(outputs, np.arctanh(actions)[:, None])
+    log_density = log_probability(outputs, np.arctanh(actions)[:, None])
     assert_allclose(np.trapezoid(np.exp(log_density), actions), 1.0, atol=1e-3)
 
 
 def test_the_log_density_of_actions_is_that_of_a_change_of_variables():
-    outputs, x = jnp.array([0.5, -0.2, 0.1, -1.0]), jnp.array([0.7, -1.1])
-    mean, std = networks.tanh_normal(outputs)
-    normal = -0.5 * ((x - mean) / std) ** 2 - jnp.log(std) - 0.5 * math.log(2 * math.pi)
-    expected = (normal - jnp.log(1 - jnp.tanh(x) ** 2)).sum()
-    assert_allclose(networks.tanh_normal_log_probability(outputs, x), expected, rtol=1e-5)
+    outputs, x = np.float32([0.5, -0.2, 0.1, -1.0]), np.float32([0.7, -1.1])
+    mean, std = map(np.asarray, jax.jit(networks.tanh_normal)(outputs))
+    normal = -0.5 * ((x - mean) / std) ** 2 - np.log(std) - 0.5 * math.log(2 * math.pi)
+    expected = (normal - np.log(1 - np.tanh(x) ** 2)).sum()
+    assert_allclose(log_probability(outputs, x), expected, rtol=1e-5)
 
 
 def test_the_mode_is_the_most_likely_of_its_samples():
-    outputs = jnp.array([0.4, -3.0])
-    key = jax.random.key(3)
-    mean, std = networks.tanh_normal(outputs)
-    candidates = mean + std * jax.random.normal(key, (networks.MODE_SAMPLES, 1))
-    scores = networks.tanh_normal_log_probability(outputs, candidates)
-    expected = jnp.tanh(candidates[jnp.argmax(scores)])
-    assert_array_equal(networks.tanh_normal_mode(outputs, key), expected)
+    outputs, key = np.float32([0.4, -3.0]), jax.random.key(3)
+    mean, std = map(np.asarray, jax.jit(networks.tanh_normal)(outputs))
+    candidates = mean + std * np.asarray(jax.random.normal(key, (networks.MODE_SAMPLES, 1)))
+    likeliest = np.argmax(log_probability(outputs, candidates))
+    expected = np.tanh(candidates[likeliest])
+    assert_allclose(jax.jit(networks.tanh_normal_mode)(outputs, key), expected, rtol=1e-6)
+    assert len(np.unique(candidates)) == networks.MODE_SAMPLES
 
 
 def test_one_hot_samples_are_exact_and_pass_the_gradient_of_probabilities():
-    logits = jnp.array([[0.1, 2.0, -1.0], [3.0, 0.0, 0.2]])
-    noise = jax.random.gumbel(jax.random.key(0), logits.shape)
-    sample = networks.one_hot_sample(logits, noise)
+    logits = np.float32([[0.1, 2.0, -1.0], [3.0, 0.0, 0.2]])
+    noise = np.random.default_rng(0).gumbel(size=logits.shape).astype(np.float32)
+    sample = np.asarray(jax.jit(networks.one_hot_sample)(logits, noise))
     assert set(np.unique(sample)) == {0.0, 1.0}
     assert_array_equal(sample.sum(-1), 1.0)
-    direction = jnp.array([1.0, -2.0, 0.5])
-    straight = jax.grad(lambda x: (networks.one_hot_sample(x, noise) * direction).sum())(logits)
-    smooth = jax.grad(lambda x: (jax.nn.softmax(x) * direction).sum())(logits)
-    assert_allclose(straight, smooth, rtol=1e-6)
+    direction = np.float32([1.0, -2.0, 0.5])
+
+    @jax.jit
+    @jax.grad
+    def straight(x):
+        return (networks.one_hot_sample(x, noise) * direction).sum()
+
+    @jax.jit
+    @jax.grad
+    def smooth(x):
+        return (jax.nn.softmax(x) * direction).sum()
+
+    assert_allclose(straight(logits), smooth(logits), rtol=1e-5, atol=1e-7)
 
 
 def test_one_hot_samples_have_the_probabilities_of_the_logits():
-    logits = jnp.log(jnp.array([0.7, 0.2, 0.1]))
-    noise = jax.random.gumbel(jax.random.key(0), (20_000, 3))
-    assert_allclose(networks.one_hot_sample(logits, noise).mean(0), [0.7, 0.2, 0.1], atol=0.015)
+    logits = np.log(np.float32([0.7, 0.2, 0.1]))
+    noise = np.random.default_rng(0).gumbel(size=(20_000, 3)).astype(np.float32)
+    samples = np.asarray(jax.jit(networks.one_hot_sample)(logits, noise))
+    assert_allclose(samples.mean(0), [0.7, 0.2, 0.1], atol=0.015)

@@ -11,10 +11,9 @@ from dreamer_jax import networks
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.diagnosis import diagnose
-from dreamer_jax.population import init_members
-from dreamer_jax.rollout import collect
-from probes import Probe
-from runs import random_members
+from dreamer_jax.population import batch_shapes
+from dreamer_jax.records import Records
+from runs import random_params
 
 A, STORED, UPDATES, SEEDS = 2, 10, 100, 3
 CONFIG = preset("debug")
@@ -27,20 +26,39 @@ def agent_of(precision):
     return Agent(dataclasses.replace(CONFIG, network=network), A)
 
 
-def stored_batches(agent):
-    """Batches [STORED, B, L, ...] of random steps in the probe."""
-    records = collect(
-        agent,
-        Probe(action_size=A),
-        random_members(agent, [0]),
-        jnp.zeros(1, jnp.int32),
-        jnp.zeros(1, jnp.int32),
-        jnp.int32(0),
-        tasks=1,
-        ticks=STORED * B * L - 1,
-        mode="random",
+def stored_batches():
+    """Batches [STORED, B, L, ...] of random steps of a point, which a bright column shows: its
+    reward depends on the action, and it falls whenever it is at one of both ends."""
+    random, size = np.random.default_rng(0), CONFIG.network.image_size
+    steps = STORED * B * L
+    records = Records(
+        image=np.full((steps, size, size, 3), 40, np.uint8),
+        action=random.uniform(-1, 1, (steps, A)).astype(np.float32),
+        reward=np.zeros(steps, np.float32),
+        first=np.zeros(steps, bool),
+        terminal=np.zeros(steps, bool),
     )
-    return records.at(0, 0).map(lambda x: x.reshape(STORED, B, L, *x.shape[1:]))
+    column = fallen = None
+    for step in range(steps):
+        if column is None or fallen:
+            column, fallen, records.first[step] = size // 2, False, True
+            records.action[step] = 0
+        else:
+            column += round(4 * records.action[step, 0])
+            fallen = abs(column - size // 2) > 6
+            records.terminal[step] = fallen
+            records.reward[step] = 1 - (records.action[step, 0] - 0.5) ** 2
+        records.image[step, :, column] = 255
+    return records.map(lambda x: x.reshape(STORED, B, L, *x.shape[1:]))
+
+
+@pytest.fixture(scope="module")
+def bfloat16_update():
+    """An update in bfloat16, traced: the program, and the shapes that go in and come out."""
+    agent = agent_of("bfloat16")
+    state = jax.eval_shape(agent.init, 0)
+    traced, out = jax.make_jaxpr(agent.update, return_shape=True)(state, batch_shapes(agent, B, L))
+    return traced.jaxpr, state, out
 
 
 def equations(jaxpr):
@@ -57,11 +75,9 @@ def dtypes(tree):
     return {str(x.dtype) for x in jax.tree.leaves(tree)}
 
 
-def test_parameters_states_distributions_and_losses_stay_float32():
+def test_parameters_states_distributions_and_losses_stay_float32(bfloat16_update):
     agent = agent_of("bfloat16")
-    state = jax.eval_shape(agent.init, 0)
-    batch = jax.eval_shape(lambda: jax.tree.map(lambda x: x[0], stored_batches(agent)))
-    new, metrics = jax.eval_shape(agent.update, state, batch)
+    _, state, (new, metrics) = bfloat16_update
     assert dtypes((state.params, new.params, metrics)) == {"float32"}
     moments = [x for x in jax.tree.leaves(new.optimisers) if x.ndim]
     assert dtypes(moments) == {"float32"}
@@ -72,28 +88,32 @@ def test_parameters_states_distributions_and_losses_stay_float32():
         heads = [agent.head(params, name, features) for name in agent.heads]
         return observed, heads, agent.decode(params, features)
 
-    assert dtypes(jax.eval_shape(outputs, state.params, batch)) == {"float32"}
+    assert dtypes(jax.eval_shape(outputs, state.params, batch_shapes(agent, B, L))) == {"float32"}
 
 
 @pytest.mark.parametrize("offset_by", ["bias", "product"])
 def test_a_bfloat16_head_tells_values_about_150_apart(offset_by):
     """True values of 150 ± 0.5: rounded to bfloat16 they would be 150, or one beside it."""
     head = networks.Head(1, layers=1, units=400, dtype=jnp.bfloat16)
-    inputs = jnp.linspace(-1, 1, 4096)[:, None]
-    params = networks.Head(1, layers=1, units=400).init(jax.random.key(0), inputs)["params"]
+    inputs = np.linspace(-1, 1, 4096, dtype=np.float32)[:, None]
+    params = jax.jit(networks.Head(1, layers=1, units=400).init)(jax.random.key(0), inputs)
+    params = jax.tree.map(np.array, params["params"])
     # Hidden units are about 1 each and move with the input, their sum does not.
     params["hidden_0"]["kernel"] -= params["hidden_0"]["kernel"].mean()
     params["hidden_0"]["bias"] += 1.0
-    hidden = networks.elu(inputs @ params["hidden_0"]["kernel"] + params["hidden_0"]["bias"])
+    hidden = inputs @ params["hidden_0"]["kernel"] + params["hidden_0"]["bias"]
+    hidden = np.where(hidden > 0, hidden, np.expm1(hidden))
     mean, (slope,) = 150.0, params["hidden_0"]["kernel"]
     weights = 0.5 * slope / (slope @ slope)
     weights += mean / 400 if offset_by == "product" else 0.0
     params["out"]["kernel"] = weights[:, None]
     params["out"]["bias"] += mean - (hidden @ weights).mean()
-    truth = head.clone(dtype=jnp.float32).apply({"params": params}, inputs)[:, 0]
+    truth, values = (
+        np.asarray(jax.jit(each.apply)({"params": params}, inputs)[:, 0])
+        for each in (head.clone(dtype=jnp.float32), head)
+    )
     assert 149.4 < truth.min() < 149.6 and 150.4 < truth.max() < 150.6
-    values = head.apply({"params": params}, inputs)[:, 0]
-    assert values.dtype == jnp.float32
+    assert values.dtype == np.float32
     # Weights that are rounded move all values by as much, which is not what is looked at here.
     difference = values - truth
     assert (difference - difference.mean()).std() < 0.05
@@ -124,7 +144,7 @@ def test_products_of_an_update_a_policy_and_a_diagnosis_have_the_precision_asked
     network = dataclasses.replace(CONFIG.network, matmul_precision=setting)
     agent = Agent(dataclasses.replace(CONFIG, network=network), A)
     state = jax.eval_shape(agent.init, 0)
-    batch = jax.eval_shape(lambda: jax.tree.map(lambda x: x[0], stored_batches(agent)))
+    batch = batch_shapes(agent, B, L)
     first, size = jnp.bool_(True), agent.config.network.image_size
     image, key = jnp.zeros((size, size, 3), jnp.uint8), jax.random.key(0)
 
@@ -145,13 +165,10 @@ def test_products_of_an_update_a_policy_and_a_diagnosis_have_the_precision_asked
         assert {x.params["precision"] for x in products} == {expected}
 
 
-def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
-    agent = agent_of("bfloat16")
-    state = jax.eval_shape(agent.init, 0)
-    batch = jax.eval_shape(lambda: jax.tree.map(lambda x: x[0], stored_batches(agent)))
+def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are(bfloat16_update):
     reading_bfloat16 = {
         equation.primitive.name
-        for equation in equations(jax.make_jaxpr(agent.update)(state, batch).jaxpr)
+        for equation in equations(bfloat16_update[0])
         if any(getattr(x.aval, "dtype", None) == jnp.bfloat16 for x in equation.invars)
     }
     assert "dot_general" in reading_bfloat16
@@ -161,25 +178,21 @@ def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are():
 
 
 def test_after_100_updates_the_losses_are_those_of_float32_within_a_tenth_of_the_noise_of_seeds():
-    batches = stored_batches(agent_of("float32"))
-    starts = init_members(agent_of("float32"), jnp.arange(SEEDS))
+    batches = stored_batches()
 
     def losses(precision, seeds):
         """Those of all updates, each [seeds, UPDATES]."""
         agent = agent_of(precision)
-
-        def update(state, number):
-            state, metrics = agent.update(state, jax.tree.map(lambda x: x[number], batches))
-            return state, {name: metrics[name] for name in LOSSES}
-
-        def train(state):
-            return jax.lax.scan(update, state, jnp.arange(UPDATES) % STORED)
-
-        # One after another: that compiles faster than all at once.
-        every = jax.jit(lambda states: jax.lax.map(train, states))
-        states, history = every(jax.tree.map(lambda x: x[:seeds], starts))
-        assert states.healthy.all()
-        return {name: np.asarray(x) for name, x in history.items()}
+        start, update = jax.jit(agent.start), jax.jit(agent.update)
+        history = {name: np.zeros((seeds, UPDATES)) for name in LOSSES}
+        for seed in range(seeds):
+            state = start(random_params(agent, seed), seed)
+            for number in range(UPDATES):
+                state, metrics = update(state, batches.at(number % STORED))
+                for name in LOSSES:
+                    history[name][seed, number] = metrics[name]
+            assert state.healthy
+        return history
 
     # Other seeds in float32 say what noise is; in bfloat16 the first one is enough.
     exact, rounded = losses("float32", SEEDS), losses("bfloat16", 1)

@@ -15,10 +15,10 @@ from transfer.freeze import combine, partition
 from transfer_trees import NnxNet, bits, library_tree, trees
 
 PARAMS = {
-    "encoder": {"kernel": jnp.array([1.0, -0.0, -2.0]), "bias": jnp.array([0.5])},
-    "head": {"kernel": jnp.array([3.0, 4.0])},
+    "encoder": {"kernel": np.float32([1.0, -0.0, -2.0]), "bias": np.float32([0.5])},
+    "head": {"kernel": np.float32([3.0, 4.0])},
 }
-GRADIENTS = jax.tree.map(lambda x: jnp.full_like(x, 0.7), PARAMS)
+GRADIENTS = jax.tree.map(lambda x: np.full_like(x, 0.7), PARAMS)
 
 # Everything that moves a parameter although its gradient is zero, or remembers it.
 STUBBORN = {
@@ -37,7 +37,7 @@ def train(optimizer, params, steps, gradients=GRADIENTS):
         updates, state = optimizer.update(gradients, state, params)
         return optax.apply_updates(params, updates), state
 
-    state, history = optimizer.init(params), []
+    state, history = jax.jit(optimizer.init)(params), []
     for _ in range(steps):
         params, state = step(params, state)
         history.append(params)
@@ -85,10 +85,15 @@ def test_masks_freeze_as_patterns_do_and_unknown_patterns_are_refused():
 def test_freezing_works_for_every_member_of_a_population_under_vmap():
     optimizer = transfer.freeze(optax.adamw(0.1, weight_decay=0.5), "encoder/**")
     population = transfer.replicate(PARAMS, size=3)
-    state = jax.vmap(optimizer.init)(population)
     gradients = transfer.replicate(GRADIENTS, size=3)
-    updates, _ = jax.jit(jax.vmap(optimizer.update))(gradients, state, population)
-    moved = optax.apply_updates(population, updates)
+
+    @jax.jit
+    @jax.vmap
+    def moved_once(params, gradients):
+        updates, _ = optimizer.update(gradients, optimizer.init(params), params)
+        return optax.apply_updates(params, updates)
+
+    moved = moved_once(population, gradients)
     assert bits(moved["encoder"]) == bits(population["encoder"])
     assert (moved["head"]["kernel"] != population["head"]["kernel"]).all()
 
@@ -98,8 +103,13 @@ def test_freezing_works_in_an_equinox_training_step():
     params, static = eqx.partition(model, eqx.is_array)
     optimizer = transfer.freeze(optax.adamw(0.1, weight_decay=0.5), "layers/0/*")
     loss = lambda params: (eqx.combine(params, static)(jnp.ones(4)) ** 2).sum()  # noqa: E731
-    updates, _ = optimizer.update(jax.grad(loss)(params), optimizer.init(params), params)
-    moved = eqx.apply_updates(params, updates)
+
+    @eqx.filter_jit
+    def step(params):
+        updates, _ = optimizer.update(jax.grad(loss)(params), optimizer.init(params), params)
+        return eqx.apply_updates(params, updates)
+
+    moved = step(params)
     assert bits(moved.layers[0]) == bits(model.layers[0])
     assert (moved.layers[1].weight != model.layers[1].weight).all()
 
@@ -112,7 +122,11 @@ def test_freezing_works_in_an_nnx_training_step():
     def loss(model):
         return ((model.out(model.hidden(jnp.ones((1, 4)))) - 1) ** 2).sum()
 
-    optimizer.update(model, nnx.grad(loss)(model))
+    @nnx.jit
+    def step(model, optimizer):
+        optimizer.update(model, nnx.grad(loss)(model))
+
+    step(model, optimizer)
     after = bits(nnx.state(model))
     assert {path for path in before if before[path] != after[path]} == {"out/kernel", "out/bias"}
 
@@ -164,7 +178,10 @@ def test_a_leaf_named_by_two_patterns_is_refused():
 def test_multipliers_scale_the_whole_update_of_their_leaves():
     plain = optax.adamw(0.1, weight_decay=0.5)
     scaled = transfer.scale_learning_rates(plain, {"encoder/kernel": 0.5, "head/*": 2.0})
-    updates, _ = plain.update(GRADIENTS, plain.init(PARAMS), PARAMS)
+    updates, found = (
+        jax.jit(lambda p, g, each=each: each.update(g, each.init(p), p)[0])(PARAMS, GRADIENTS)
+        for each in (plain, scaled)
+    )
     expected = {
         "encoder": {
             "kernel": updates["encoder"]["kernel"] * 0.5,
@@ -172,7 +189,6 @@ def test_multipliers_scale_the_whole_update_of_their_leaves():
         },
         "head": {"kernel": updates["head"]["kernel"] * 2.0},
     }
-    found, _ = scaled.update(GRADIENTS, scaled.init(PARAMS), PARAMS)
     same(found, expected)
 
 

@@ -46,7 +46,7 @@ def test_points_on_a_grid_are_classified_as_by_scikit_learn_ties_included(featur
     latents, labels = grid(300, features, size), random.integers(0, 4, 300)
     queries = grid(2000, features, size)
     model = fit(latents, labels)
-    result = classify(model, queries, np.inf)
+    result = jax.tree.map(np.asarray, classify(model, queries, np.inf))
     votes, distances, order = reference(latents, labels, queries)
     found = nearest(model, queries)
     np.testing.assert_array_equal(found.indices, order)
@@ -115,21 +115,23 @@ def test_no_array_of_all_queries_times_all_samples_times_all_features_is_made():
 
 def test_thresholds_classifiers_and_sets_of_queries_can_be_mapped():
     models = [fit(gaussian(30, 5), random.integers(0, 3, 30)) for _ in range(2)]
-    queries = jnp.stack([gaussian(9, 5), gaussian(9, 5)])
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *models)
-    mapped = jax.vmap(classify, in_axes=(0, 0, None))(stacked, queries, 3.0)
+    queries = np.stack([gaussian(9, 5), gaussian(9, 5)])
+    stacked = jax.tree.map(lambda *x: np.stack(x), *models)
+    mapped = jax.jit(jax.vmap(classify, in_axes=(0, 0, None)))(stacked, queries, 3.0)
+    mapped = jax.tree.map(np.asarray, mapped)
     for index, model in enumerate(models):
         for a, b in zip(mapped, classify(model, queries[index], 3.0), strict=True):
             np.testing.assert_array_equal(a[index], b)
-    thresholds = jnp.array([0.0, 2.0, 100.0])
-    several = jax.vmap(classify, in_axes=(None, None, 0))(models[0], queries[0], thresholds)
+    thresholds = np.array([0.0, 2.0, 100.0])
+    over_thresholds = jax.jit(jax.vmap(classify, in_axes=(None, None, 0)))
+    several = jax.tree.map(np.asarray, over_thresholds(models[0], queries[0], thresholds))
     assert (several.labels[0] == NOVEL).all() and (several.labels[2] != NOVEL).all()
 
 
 def test_accuracy_counts_known_tasks_as_known_and_right_and_novel_ones_as_novel():
     # Two tasks far apart, one query of each kind of mistake.
     model = fit([[0.0], [0.1], [10.0], [10.1]], [0, 0, 1, 1], neighbours=2)
-    queries = jnp.array([[0.0], [0.2], [10.0], [60.0]])
+    queries = np.array([[0.0], [0.2], [10.0], [60.0]])
     known = accuracy(classify(model, queries, 5.0), 0)
     assert known.correct == 0.5 and known.not_novel == 0.75 and known.right_task == 0.5
     novel = accuracy(classify(model, queries, 5.0), NOVEL)

@@ -2,11 +2,11 @@
 
 import ast
 import dataclasses
+import functools
 from collections import Counter
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -27,8 +27,13 @@ AGENTS = {
 }
 
 
-def agent_tree(preset="debug", action_size=3, discrete=False, meta=(), samples=0, **network):
+def agent_tree(**settings):
     """The shapes of a real agent's parameters, with meta-models of the components in `meta`."""
+    return jax.tree.map(lambda x: x, _shapes(**settings))
+
+
+@functools.cache
+def _shapes(preset="debug", action_size=3, discrete=False, meta=(), samples=0, **network):
     chosen = config.preset(preset)
     chosen = dataclasses.replace(
         chosen, network=dataclasses.replace(chosen.network, **{"image_size": 64} | network)
@@ -61,7 +66,7 @@ def operations(plan, tree):
 @pytest.mark.parametrize("preset", ["thesis", "debug"])
 @pytest.mark.parametrize("name", AGENTS)
 def test_fractional_transfer_treats_each_component_as_figure_8_says(preset, name):
-    tree = agent_tree(preset, **AGENTS[name])
+    tree = agent_tree(preset=preset, **AGENTS[name])
     layers = 3 if name == "32 pixels" else 4
     expected = {
         ("encoder", "copy"): 2 * layers,
@@ -179,14 +184,15 @@ def test_one_population_holds_targets_of_all_fractions_seeds_and_source_sets():
         transfer.source_leaves(plan, targets[0], filled(agent_tree(action_size=size), size))
         for size in (3, 6, 8, 8)
     ]
-    omegas = jnp.array([0.0, 0.1, 0.2, 0.5])
+    omegas = np.array([0.0, 0.1, 0.2, 0.5], np.float32)
     stacked = [jax.tree.map(lambda *x: np.stack(x), *trees) for trees in (targets, sources)]
     run = jax.jit(jax.vmap(lambda t, s, w: transfer.apply(plan, t, s, omega=w)))
     mapped, report = run(*stacked, omegas)
     bound = recipes.fractional_transfer(omegas)
     at_once, _ = jax.jit(lambda t, s: transfer.apply(bound, t, s, population=True))(*stacked)
+    by_itself = jax.jit(lambda t, s, w: transfer.apply(plan, t, s, omega=w)[0])
     for index, omega in enumerate(omegas.tolist()):
-        alone, _ = transfer.apply(plan, targets[index], sources[index], omega=omega)
+        alone = by_itself(targets[index], sources[index], omega)
         for path, leaf in transfer.flatten(alone).items():
             for population in (mapped, at_once):
                 np.testing.assert_allclose(

@@ -315,10 +315,11 @@ PARAMS = {"a": jnp.ones(2), "b": jnp.ones(2), "c": jnp.ones(2)}
 
 
 def updates(optimizer, gradients, steps):
-    state, found = optimizer.init(PARAMS), []
+    state, found = jax.jit(optimizer.init)(PARAMS), []
+    step = jax.jit(optimizer.update)
     for _ in range(steps):
-        update, state = optimizer.update(gradients, state, PARAMS)
-        found.append(update)
+        update, state = step(gradients, state, PARAMS)
+        found.append(jax.tree.map(np.asarray, update))
     return found
 
 

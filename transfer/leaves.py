@@ -254,7 +254,8 @@ def cast(path: str, result: Array, target: Array, *, casting: str = "same_kind")
             result = result.astype(dtype)
     sharding = _sharding(target)
     if not isinstance(result, jax.Array):
-        result = jnp.array(result, copy=True)
+        # Copied by NumPy, which compiles nothing for it.
+        result = jnp.asarray(np.array(result))
     if sharding is None or not is_concrete(result):
         return result
     return result if result.sharding == sharding else jax.device_put(result, sharding)

@@ -122,8 +122,8 @@ Array([ 0.4,  1. , 21. ], dtype=float32))
         raise ValueError(f"Got {len(latents)} samples for {neighbours} neighbours.")
     if not isinstance(latents, jax.core.Tracer) and not np.isfinite(latents).all():
         raise ValueError("Latents must be finite; some are not.")
-    if not isinstance(labels, jax.core.Tracer) and np.min(labels) < 0:
-        raise ValueError(f"Labels number the tasks from 0; got {np.min(labels)}.")
+    if not isinstance(labels, jax.core.Tracer) and (least := np.asarray(labels).min()) < 0:
+        raise ValueError(f"Labels number the tasks from 0; got {least}.")
     return Classifier(latents, labels.astype(jnp.int32), neighbours)
 
 
@@ -164,6 +164,7 @@ def _in_chunks(function, queries: Any, numbers_each: int) -> Any:
     return jax.lax.map(function, queries, batch_size=max(1, _CHUNK // numbers_each))
 
 
+@jax.jit
 def vote(labels: Array) -> Array:
     """The most frequent label, the smallest of those that are equally frequent.
 
@@ -213,6 +214,7 @@ def _classify(model: Classifier, latents: ArrayLike, threshold: Any) -> Classifi
     return Classification(jnp.where(known, votes, NOVEL), votes, distances, finite)
 
 
+@jax.jit
 def accuracy(result: Classification, task: Any) -> Accuracy:
     """The accuracy of a set of samples of one task (§4.3.3).
 
@@ -266,16 +268,17 @@ def suggest_threshold(model: Classifier, *, quantile: float = 0.95, groups: Any 
         raise ValueError(f"Expected one group for each of {samples} samples, got {groups.shape}.")
 
     rank = min(samples, int(np.ceil((samples + 1) * quantile)))
-    return jnp.sort(_to_other_groups(model.latents, groups))[rank - 1]
+    return _distance_of_rank(model.latents, groups, rank)
 
 
 @jax.jit
-def _to_other_groups(latents: Array, groups: Array) -> Array:
-    """The distance from each sample to the nearest one of another group, float32 [S]."""
+def _distance_of_rank(latents: Array, groups: Array, rank: int) -> Array:
+    """The distance of that rank, from 1, of those from each sample to the nearest of another
+    group."""
 
     def one(query):
         latent, group = query
         distances = jnp.abs(latents - latent).sum(-1)
         return jnp.where(groups == group, jnp.inf, distances).min()
 
-    return _in_chunks(one, (latents, groups), latents.size)
+    return jnp.sort(_in_chunks(one, (latents, groups), latents.size))[rank - 1]

@@ -13,6 +13,7 @@ population each member is merged by itself, with numbers [P] and [P, N] where th
 Axis letters: P population member, N source; n numbers in a leaf.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -56,11 +57,14 @@ def merge_leaves(
     population: bool,
     key: jax.Array | None = None,
     reads_target: bool = True,
+    settings: tuple[tuple[str, Any], ...] = (),
     **given: Number,
 ) -> PyTree:
-    """`formula(base, models, *numbers)` of each leaf, in float32 at least.
+    """`formula(base, models, *numbers, **settings)` of each leaf, in float32 at least.
 
-    `models` is [N, ...]; with a key, uniform numbers of its shape come before the numbers.
+    `models` is [N, ...]; with a key, uniform numbers of its shape come before the numbers. The
+    formula is a function of a module, so that what is compiled for leaves of one shape is found
+    again by the next merge.
     """
     flat = [flatten(source) for source in sources]
     if not flat:
@@ -82,23 +86,31 @@ def merge_leaves(
         base = wide(path, leaf if reads_target else others[0])
         # [P, N, ...] for a population, so that members are mapped and sources follow.
         axis = 1 if population else 0
-        models = jnp.stack([wide(path, other) for other in others], axis=axis)
+        models = tuple(wide(path, other) for other in others)
         arguments = [base, models]
         axes: list[int | None] = [0, 0]
         if key is not None:
-            arguments.append(
-                draw(jax.random.uniform, path, key, models.shape, jnp.float32, population)
-            )
+            shape = (*base.shape[:axis], len(models), *base.shape[axis:])
+            arguments.append(draw(jax.random.uniform, path, key, shape, jnp.float32, population))
             axes.append(0)
         for name, number in given.items():
             value, mapped = _shaped(path, name, number, by_leaf[name][path], base, len(flat), axis)
             arguments.append(value)
             axes.append(0 if mapped else None)
-        if population:
-            return cast(path, jax.vmap(formula, in_axes=tuple(axes))(*arguments), leaf)
-        return cast(path, formula(*arguments), leaf)
+        merge = _merge(formula, settings, tuple(axes) if population else None)
+        return cast(path, merge(*arguments), leaf)
 
     return change(target, where, leaf_operation)
+
+
+@functools.cache
+def _merge(formula: Callable[..., Array], settings: tuple, axes: tuple | None) -> Callable:
+    """A formula with its settings as a program of one leaf, or of one leaf of all members."""
+
+    def merged(base, models, *numbers):
+        return formula(base, jnp.stack(models), *numbers, **dict(settings))
+
+    return jax.jit(merged if axes is None else jax.vmap(merged, in_axes=axes))
 
 
 def _shaped(path, name, number: Number, value, base, count: int, members: int):
@@ -149,19 +161,21 @@ def average(
         if normalise and concrete and not isinstance(entry, str) and not np.any(entry):
             raise ValueError("The weights are all 0; expected one of them greater.")
 
-    def formula(base, models, weights):
-        return combined(models, weights, normalise)
-
     return merge_leaves(
         "average",
-        formula,
+        _average,
         target,
         sources,
         where,
         population,
         reads_target=False,
+        settings=(("normalise", normalise),),
         weights=Number(weights, each=True, low=0.0, high=None),
     )
+
+
+def _average(base, models, weights, normalise):
+    return combined(models, weights, normalise)
 
 
 def weighted(weights: Array, vectors: Array) -> Array:
@@ -176,6 +190,20 @@ def combined(vectors: Array, weights: Array, normalise: bool) -> Array:
         return total
     share = weights.sum().astype(vectors.dtype)
     return total / jnp.where(share == 0, 1, share)
+
+
+def _model_stock(base, models):
+    vectors = models - base
+    count = vectors.shape[0]
+    flat = vectors.reshape(count, -1)
+    lengths = jnp.linalg.norm(flat, axis=1)
+    products = jnp.einsum("in,jn->ij", flat, jnp.conj(flat), precision="highest").real
+    lengths = lengths[:, None] * lengths
+    cosines = products / jnp.where(lengths == 0, 1, lengths)
+    pairs = np.triu_indices(count, 1)
+    cosine = jnp.clip(cosines[pairs].mean(), 0, 1)
+    share = count * cosine / (1 + (count - 1) * cosine)
+    return base + share * vectors.mean(0)
 
 
 def model_stock(
@@ -202,20 +230,7 @@ def model_stock(
     if len(sources) < 2:
         raise ValueError(f"model_stock needs two sources or more, got {len(sources)}.")
 
-    def formula(base, models):
-        vectors = models - base
-        count = vectors.shape[0]
-        flat = vectors.reshape(count, -1)
-        lengths = jnp.linalg.norm(flat, axis=1)
-        products = jnp.einsum("in,jn->ij", flat, jnp.conj(flat), precision="highest").real
-        lengths = lengths[:, None] * lengths
-        cosines = products / jnp.where(lengths == 0, 1, lengths)
-        pairs = np.triu_indices(count, 1)
-        cosine = jnp.clip(cosines[pairs].mean(), 0, 1)
-        share = count * cosine / (1 + (count - 1) * cosine)
-        return base + share * vectors.mean(0)
-
-    return merge_leaves("model_stock", formula, target, sources, where, population)
+    return merge_leaves("model_stock", _model_stock, target, sources, where, population)
 
 
 def _angle_weights(weight: Array, cosine: Array) -> tuple[Array, Array]:
@@ -225,6 +240,15 @@ def _angle_weights(weight: Array, cosine: Array) -> tuple[Array, Array]:
     safe = jnp.where(straight, 1.0, angle)
     first = jnp.where(straight, 1 - weight, jnp.sin((1 - weight) * safe) / jnp.sin(safe))
     return first, jnp.where(straight, weight, jnp.sin(weight * safe) / jnp.sin(safe))
+
+
+def _slerp(base, models, weight):
+    other = models[0]
+    product = (base * jnp.conj(other)).sum().real
+    lengths = jnp.linalg.norm(base) * jnp.linalg.norm(other)
+    cosine = jnp.where(lengths == 0, 1.0, product / jnp.where(lengths == 0, 1, lengths))
+    first, second = _angle_weights(weight, cosine)
+    return (first * base + second * other).astype(base.dtype)
 
 
 def slerp(
@@ -256,17 +280,31 @@ def slerp(
     Array([0.7071, 0.7071], dtype=float32)
     """
 
-    def formula(base, models, weight):
-        other = models[0]
-        product = (base * jnp.conj(other)).sum().real
-        lengths = jnp.linalg.norm(base) * jnp.linalg.norm(other)
-        cosine = jnp.where(lengths == 0, 1.0, product / jnp.where(lengths == 0, 1, lengths))
-        first, second = _angle_weights(weight, cosine)
-        return (first * base + second * other).astype(base.dtype)
+    return merge_leaves("slerp", _slerp, target, [source], where, population, weight=Number(weight))
 
-    return merge_leaves(
-        "slerp", formula, target, [source], where, population, weight=Number(weight)
-    )
+
+def _karcher_mean(base, models, weights, iterations):
+    models = models.reshape(models.shape[0], -1)
+    total = weights.sum()
+    shares = weights / jnp.where(total == 0, 1, total)
+    lengths = jnp.linalg.norm(models, axis=1)
+    points = models / jnp.where(lengths == 0, 1, lengths)[:, None]
+
+    def unit(vector):
+        length = jnp.linalg.norm(vector)
+        return vector / jnp.where(length == 0, 1, length)
+
+    def step(_, mean):
+        cosines = jnp.clip(points @ mean, -1, 1)
+        aside = points - cosines[:, None] * mean
+        size = jnp.linalg.norm(aside, axis=1)
+        tangent = aside * (jnp.arctan2(size, cosines) / jnp.where(size == 0, 1, size))[:, None]
+        move = (shares[:, None] * tangent).sum(0)
+        angle = jnp.linalg.norm(move)
+        return unit(jnp.cos(angle) * mean + jnp.sinc(angle / jnp.pi) * move)
+
+    mean = jax.lax.fori_loop(0, iterations, step, unit((shares[:, None] * points).sum(0)))
+    return ((shares * lengths).sum() * mean).reshape(base.shape)
 
 
 def karcher_mean(
@@ -301,36 +339,14 @@ def karcher_mean(
     Array([2.1213, 2.1213], dtype=float32)
     """
 
-    def formula(base, models, weights):
-        models = models.reshape(models.shape[0], -1)
-        total = weights.sum()
-        shares = weights / jnp.where(total == 0, 1, total)
-        lengths = jnp.linalg.norm(models, axis=1)
-        points = models / jnp.where(lengths == 0, 1, lengths)[:, None]
-
-        def unit(vector):
-            length = jnp.linalg.norm(vector)
-            return vector / jnp.where(length == 0, 1, length)
-
-        def step(_, mean):
-            cosines = jnp.clip(points @ mean, -1, 1)
-            aside = points - cosines[:, None] * mean
-            size = jnp.linalg.norm(aside, axis=1)
-            tangent = aside * (jnp.arctan2(size, cosines) / jnp.where(size == 0, 1, size))[:, None]
-            move = (shares[:, None] * tangent).sum(0)
-            angle = jnp.linalg.norm(move)
-            return unit(jnp.cos(angle) * mean + jnp.sinc(angle / jnp.pi) * move)
-
-        mean = jax.lax.fori_loop(0, iterations, step, unit((shares[:, None] * points).sum(0)))
-        return ((shares * lengths).sum() * mean).reshape(base.shape)
-
     return merge_leaves(
         "karcher_mean",
-        formula,
+        _karcher_mean,
         target,
         sources,
         where,
         population,
         reads_target=False,
+        settings=(("iterations", iterations),),
         weights=Number(weights, each=True, low=0.0, high=None),
     )

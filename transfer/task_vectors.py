@@ -50,6 +50,10 @@ def _elected(vectors: Array, weights: Array, normalise: bool) -> Array:
     return jnp.where(share == 0, 0, total / jnp.where(share == 0, 1, share))
 
 
+def _task_arithmetic(base, models, weights, scale, normalise):
+    return base + scale * combined(models - base, weights, normalise)
+
+
 def task_arithmetic(
     target: PyTree,
     sources: Sequence[PyTree],
@@ -81,19 +85,23 @@ def task_arithmetic(
     {'w': Array([2., 3.], dtype=float32)}
     """
 
-    def formula(base, models, weights, scale):
-        return base + scale * combined(models - base, weights, normalise)
-
     return merge_leaves(
         "task_arithmetic",
-        formula,
+        _task_arithmetic,
         target,
         sources,
         where,
         population,
+        settings=(("normalise", normalise),),
         weights=Number(weights, each=True, low=None, high=None),
         scale=Number(scale, low=None, high=None),
     )
+
+
+def _ties(base, models, density, weights, scale, normalise):
+    vectors = models - base
+    trimmed = jnp.where(_largest(vectors, _kept(density, vectors)), vectors, 0)
+    return base + scale * _elected(trimmed, weights, normalise)
 
 
 def ties(
@@ -133,22 +141,26 @@ def ties(
     {'w': Array([3., 5., 0.], dtype=float32)}
     """
 
-    def formula(base, models, density, weights, scale):
-        vectors = models - base
-        trimmed = jnp.where(_largest(vectors, _kept(density, vectors)), vectors, 0)
-        return base + scale * _elected(trimmed, weights, normalise)
-
     return merge_leaves(
         "ties",
-        formula,
+        _ties,
         target,
         sources,
         where,
         population,
+        settings=(("normalise", normalise),),
         density=Number(density, each=True),
         weights=Number(weights, each=True, low=None, high=None),
         scale=Number(scale, low=None, high=None),
     )
+
+
+def _dare(base, models, uniform, density, weights, scale, elect_sign, normalise):
+    vectors = models - base
+    share = weighted(density, vectors)
+    kept = jnp.where(uniform < share, vectors / jnp.where(share == 0, 1, share), 0)
+    merged = (_elected if elect_sign else combined)(kept, weights, normalise)
+    return base + scale * merged
 
 
 def dare(
@@ -190,25 +202,29 @@ def dare(
     {'w': Array([0., 2., 2., 0.], dtype=float32)}
     """
 
-    def formula(base, models, uniform, density, weights, scale):
-        vectors = models - base
-        share = weighted(density, vectors)
-        kept = jnp.where(uniform < share, vectors / jnp.where(share == 0, 1, share), 0)
-        merged = (_elected if elect_sign else combined)(kept, weights, normalise)
-        return base + scale * merged
-
     return merge_leaves(
         "dare",
-        formula,
+        _dare,
         target,
         sources,
         where,
         population,
+        settings=(("elect_sign", elect_sign), ("normalise", normalise)),
         key=check_key(key),
         density=Number(density, each=True),
         weights=Number(weights, each=True, low=None, high=None),
         scale=Number(scale, low=None, high=None),
     )
+
+
+def _breadcrumbs(base, models, density, outliers, weights, scale, elect_sign, normalise):
+    vectors = models - base
+    kept = _kept(density, vectors)
+    size = math.prod(vectors.shape[1:])
+    largest = jnp.minimum(_kept(outliers, vectors), size - kept)
+    between = _largest(vectors, kept, skip=largest)
+    merge = _elected if elect_sign else combined
+    return base + scale * merge(jnp.where(between, vectors, 0), weights, normalise)
 
 
 def breadcrumbs(
@@ -250,22 +266,14 @@ def breadcrumbs(
     {'w': Array([0., 2., 0., 3.], dtype=float32)}
     """
 
-    def formula(base, models, density, outliers, weights, scale):
-        vectors = models - base
-        kept = _kept(density, vectors)
-        size = math.prod(vectors.shape[1:])
-        largest = jnp.minimum(_kept(outliers, vectors), size - kept)
-        between = _largest(vectors, kept, skip=largest)
-        merge = _elected if elect_sign else combined
-        return base + scale * merge(jnp.where(between, vectors, 0), weights, normalise)
-
     return merge_leaves(
         "breadcrumbs",
-        formula,
+        _breadcrumbs,
         target,
         sources,
         where,
         population,
+        settings=(("elect_sign", elect_sign), ("normalise", normalise)),
         density=Number(density, each=True),
         outliers=Number(outliers, each=True),
         weights=Number(weights, each=True, low=None, high=None),
