@@ -76,7 +76,7 @@ class Rollout:
 
     def __init__(self, name: str, config: Config, members: int, steps: int):
         self._env = envs.make([name], members, config.network.image_size, workers=1)
-        agent = Agent(config, self._env.action_size)
+        agent = Agent(config, self._env.action_size).on_any_schedule()
         seeds, number = jnp.arange(members), jnp.int32(0)
         one = init_members(agent, jnp.arange(1)).params
         params = jax.tree.map(lambda x: jnp.repeat(x, members, axis=0), one)

@@ -88,7 +88,7 @@ class Updates:
     def __init__(
         self, config: Config, action_size: int, members: int, mapping: str = "auto", chunk: int = 1
     ):
-        agent = Agent(config, action_size)
+        agent = Agent(config, action_size).on_any_schedule()
         self._one, self._members = made_up(agent), members
         learning = config.learning
         state, batch = jax.eval_shape(self._mapped, self._one)

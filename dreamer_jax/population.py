@@ -5,12 +5,13 @@ Axis letters: P population member, K task, B batch, L sequence length, T ticks i
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dreamer_jax.agent import MODES, Agent, Mode
 from dreamer_jax.devices import Placement
@@ -101,31 +102,28 @@ def copied(tree):
     return jax.tree.map(jnp.copy, tree)
 
 
-def _fresh_members(agent: Agent, seeds: jax.Array) -> AgentState:
-    return jax.vmap(agent.init)(seeds)
+def init_members(agent: Agent, seeds: Sequence[int] | np.ndarray | jax.Array) -> AgentState:
+    """Fresh agents of the given seeds, int [P] -> NumPy leaves [P, ...].
 
-
-@functools.partial(jax.jit, static_argnames="agent")
-def init_members(agent: Agent, seeds: jax.Array) -> AgentState:
-    """Fresh agents of the given seeds: int32 [P] -> leaves [P, ...]."""
-    return _fresh_members(agent, seeds)
-
-
-def init_over(agent: Agent, placement: Placement) -> Callable[[jax.Array], AgentState]:
-    """`init_members` of one agent's functions, each device making its own members.
-
-    It is compiled quickly, and so no part of another program (JAX allows no options there).
+    They are drawn one after the other, so that populations of all sizes share one program: its
+    code takes longer to compile than members to draw.
     """
-    if placement.mesh is None:
-        return functools.partial(init_program(), agent)
-    fresh = functools.partial(init_members, agent)
-    return placement.over_devices(fresh, axes=(0,), compiler_options=_of_one_use())
+    draw = init_program()
+    members = [jax.device_get(draw(agent, np.int32(seed))) for seed in np.asarray(seeds)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
 
 
 @functools.cache
 def init_program():
-    """`init_members`, compiled quickly: one function for all that call it."""
-    return jax.jit(_fresh_members, static_argnames="agent", compiler_options=_of_one_use())
+    """`agent.init` of an agent and a seed, compiled quickly: one function for all that call it.
+
+    It is no part of another program, for JAX allows no options of compilation there.
+    """
+    return jax.jit(_fresh, static_argnames="agent", compiler_options=_of_one_use())
+
+
+def _fresh(agent: Agent, seed: jax.Array) -> AgentState:
+    return agent.init(seed)
 
 
 def _of_one_use() -> dict[str, int] | None:
@@ -211,7 +209,6 @@ class Population:
         self.own_seeds = list(own_seeds)
         self.seeds = placement.spread(jnp.array(self.own_seeds, jnp.int32))
         over = placement.over_devices
-        self._init = init_over(self._agent, placement)
         self._update = over(self._update_members, axes=(0, 0, 0), donate=(0, 1))
         self._collect = over(self._collect_members, axes=(0, 0, 0, None, None, 0))
         self._diagnose = over(functools.partial(diagnose, self._agent), axes=(0, 0, 0, None))
@@ -219,7 +216,12 @@ class Population:
 
     def fresh(self) -> AgentState:
         """Fresh agents of the members' seeds: leaves [P, ...]."""
-        return self.without_padding(self._init(self.seeds))
+        fresh = init_members(self._agent, self.own_seeds)
+        return self.put(fresh if self._placement.mesh else jax.device_put(fresh))
+
+    def shapes(self) -> AgentState:
+        """Their shapes, `jax.ShapeDtypeStruct` [P with padding, ...]."""
+        return jax.eval_shape(jax.vmap(self._agent.init), self.seeds)
 
     def put(self, state: AgentState) -> AgentState:
         """Agents brought to their devices."""

@@ -5,7 +5,9 @@ A action. The environment is any object with `reset(slot, key) -> (state, TimeSt
 `step(state, action) -> (state, TimeStep)` that is traceable and maps under `jax.vmap`, where a
 time step has the fields image, reward, first and terminal; after a terminal tick the next step
 resets. It may have `before(slot, key) -> state` too, a state that the next step resets: then a
-program holds the environment once, not once for the reset and once for the steps.
+program holds the environment once, not once for the reset and once for the steps. And it may have
+`program`, an object with these methods that compiled programs hold in its place, so that an
+environment made after it shares them.
 """
 
 import functools
@@ -110,6 +112,8 @@ def collect(
       Records with leading axes [P, K, T + 1].
     """
     number = jnp.int32(MODES.index(mode)) if isinstance(mode, str) else mode
+    if not isinstance(seeds, jax.core.Tracer):
+        env = getattr(env, "program", env)
     return _collect(
         agent, env, params, seeds, updates, phase, number, numbers, tasks=tasks, ticks=ticks
     )

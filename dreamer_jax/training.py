@@ -138,7 +138,12 @@ class Run:
             raise ValueError(
                 f"the state holds {state.updates.shape} members, {len(self.members)} are named"
             )
-        self.state = population.fresh() if state is None else population.put(state)
+        if state is not None:
+            self.state = population.put(state)
+        else:
+            # What goes on needs no agents that are then thrown away.
+            begun = self.checkpoints.latest() is not None
+            self.state = population.shapes() if begun else population.fresh()
         self.sums = population.zero_sums(self.state)
         self._restore(from_checkpoint)
 

@@ -102,6 +102,20 @@ class BraxEnv:
         self._reset = mapped_rows(self._reset_rows)
         self._step = mapped_rows(self._step_rows)
 
+    # It holds nothing that changes: what is compiled for one serves all that are alike.
+
+    def _alike(self) -> tuple:
+        return (
+            type(self), self.tasks, self.members, self.shards, self.image_size, self.action_repeat,
+            self.action_size,
+        )  # fmt: skip
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BraxEnv) and self._alike() == other._alike()
+
+    def __hash__(self) -> int:
+        return hash(self._alike())
+
     def reset(self, slot: jax.Array, key: jax.Array) -> tuple[BraxState, TimeStep]:
         """Start a phase, seeded by `key` (typed or raw), in `slot` (int32 [])."""
         return self._reset(key_words(slot, key))
@@ -267,6 +281,9 @@ class HostDrawnBraxEnv(BraxEnv):
         self.hurry()
         jax.effects_barrier()
         self._pool.close()
+
+    def _alike(self) -> tuple:
+        return (id(self),)  # Its processes are its own.
 
     def _views(self, task: int, states) -> jax.Array:
         """Joint positions float32 [n, Q] of Brax's states of task number `task`."""

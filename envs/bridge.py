@@ -9,6 +9,8 @@ images travel as one row of 32-bit words for each simulator.
 
 from __future__ import annotations
 
+import threading
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -52,26 +54,21 @@ class HostCalls:
         Returns:
           The function of int32 [W]. Map over the row if anything is mapped.
         """
+        return on_host(self.guarded(host, results), results)
 
-        def shapes(count):
-            return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), results)
+    def guarded(self, host: Callable[[np.ndarray], Any], results: Any) -> Callable:
+        """The same function on the host still: it keeps an error, and answers with zeros then."""
 
-        def guarded(rows):
+        def answer(rows):
             rows = np.asarray(rows)
             if self._error is None:
                 try:
                     return host(rows)
                 except BaseException as error:  # KeyboardInterrupt too: `check` raises it
                     self._error = error
-            return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes(len(rows)))
+            return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), _shapes(results, len(rows)))
 
-        def call(rows):
-            results = io_callback(guarded, shapes(len(rows)), rows, ordered=True)
-            # Without the barrier XLA writes results that a scan keeps by a fusion that takes the
-            # callback's token along, and ends the process over it (NVIDIA cards, jaxlib 0.11.2).
-            return jax.lax.optimization_barrier(results)
-
-        return mapped_rows(call)
+        return answer
 
     def check(self) -> None:
         """Wait for callbacks under way and raise the error that one of them met, if any."""
@@ -79,6 +76,23 @@ class HostCalls:
         error, self._error = self._error, None
         if error is not None:
             raise error
+
+
+def _shapes(results: Any, count: int) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), results)
+
+
+def on_host(answer: Callable[[np.ndarray], Any], results: Any) -> Callable:
+    """A function on the host that raises nothing as one of a single row, see
+    `HostCalls.mapped`."""
+
+    def call(rows):
+        found = io_callback(answer, _shapes(results, len(rows)), rows, ordered=True)
+        # Without the barrier XLA writes results that a scan keeps by a fusion that takes the
+        # callback's token along, and ends the process over it (NVIDIA cards, jaxlib 0.11.2).
+        return jax.lax.optimization_barrier(found)
+
+    return mapped_rows(call)
 
 
 def _time_step(slot, image, row) -> tuple[Token, TimeStep]:
@@ -94,6 +108,64 @@ def _host_results(ticks: np.ndarray, time_step: TimeStep) -> tuple[np.ndarray, n
     row[:, 2] = time_step.first
     row[:, 3] = time_step.terminal
     return time_step.image, row
+
+
+class HostSlots:
+    """Host simulators as compiled programs hold them: it is the environment that has them lent at
+    the time that answers. So those that are made one after the other share their programs, which
+    no cache on the disk can hold.
+
+    Args:
+      image_size, action_size: of the environments.
+    """
+
+    has_host = True
+    _free: dict[tuple[int, int], list[HostSlots]] = {}
+    _lock = threading.Lock()
+
+    def __init__(self, image_size: int, action_size: int):
+        self.image_size, self.action_size = image_size, action_size
+        self._env: Callable[[], HostEnv | None] = lambda: None
+        results = _results(image_size)
+        self._call_reset = on_host(lambda rows: self._holder().answer_reset(rows), results)
+        self._call_step = on_host(lambda rows: self._holder().answer_step(rows), results)
+
+    @classmethod
+    def lent_to(cls, env: HostEnv) -> HostSlots:
+        """Some that no other environment has, until they are given back."""
+        sizes = env.image_size, env.action_size
+        with cls._lock:
+            free = cls._free.setdefault(sizes, [])
+            slots = free.pop() if free else cls(*sizes)
+        slots._env = weakref.ref(env)
+        return slots
+
+    def give_back(self) -> None:
+        self._env = lambda: None
+        with self._lock:
+            self._free[self.image_size, self.action_size].append(self)
+
+    def _holder(self) -> HostEnv:
+        env = self._env()
+        if env is None:
+            raise SimulatorError("the environment of this program is closed")
+        return env
+
+    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
+        """See `HostEnv.reset`."""
+        row = key_words(slot, key)
+        return _time_step(row[0], *self._call_reset(row))
+
+    def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
+        """See `HostEnv.step`."""
+        row = action_words(state, action, self.action_size)
+        return _time_step(state.slot, *self._call_step(row))
+
+
+def _results(image_size: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
+    """What the host answers for one slot: the image, and the words of `_host_results`."""
+    image = jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8)
+    return image, jax.ShapeDtypeStruct((4,), jnp.int32)
 
 
 class HostEnv:
@@ -137,12 +209,22 @@ class HostEnv:
         self._pool = SimulatorPool(
             self.tasks * members, image_size, action_size, action_repeat, workers, timeout, share
         )
-        results = (
-            jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8),
-            jax.ShapeDtypeStruct((4,), jnp.int32),
-        )
-        self._call_reset = self._calls.mapped(self._host_reset, results)
-        self._call_step = self._calls.mapped(self._host_step, results)
+        results = _results(image_size)
+        self.answer_reset = self._calls.guarded(self._host_reset, results)
+        self.answer_step = self._calls.guarded(self._host_step, results)
+        self._call_reset = on_host(self.answer_reset, results)
+        self._call_step = on_host(self.answer_step, results)
+        self._lent: HostSlots | None = None
+        self._closed = False
+
+    @property
+    def program(self) -> HostSlots | HostEnv:
+        """What programs that outlive this environment are to hold in its place."""
+        if self._lent is None:
+            if self._closed:
+                return self
+            self._lent = HostSlots.lent_to(self)
+        return self._lent
 
     def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
         """Put a new simulator, seeded by `key` (typed or raw), into `slot` (int32 []).
@@ -190,6 +272,9 @@ class HostEnv:
         self.hurry()
         jax.effects_barrier()
         self._pool.close()
+        lent, self._lent, self._closed = self._lent, None, True
+        if lent is not None:
+            lent.give_back()
 
     def _host_reset(self, words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slots, keys = words[:, 0], words[:, 1:].view(np.uint32)

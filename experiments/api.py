@@ -260,7 +260,7 @@ def load(trained: Trained | str | Path, member: int = 0) -> Player:
       ValueError: there is no such agent, or it failed.
     """
     source = load_source(_folder(trained), member)
-    return Player(source.spec, make_agent(source.spec), jax.tree.map(jnp.asarray, source.params))
+    return Player(source.spec, make_agent(source.spec), jax.device_put(source.params))
 
 
 def _folder(trained: Trained | str | Path) -> str:

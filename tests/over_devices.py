@@ -28,7 +28,7 @@ from dreamer_jax.training import Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
 from experiments.runs import evaluate as evaluation
-from experiments.runs.evaluate import load_agents
+from experiments.runs.evaluate import Agents
 from experiments.runs.start import load_sources, transferred_members
 from probes import Inside
 from runs import batch_for, random_members, spec_of, write_run
@@ -210,20 +210,20 @@ def the_real_update_is_the_same_on_a_device_of_its_own(folder):
 
 def agents_are_evaluated_on_their_devices_as_on_one(folder):
     """5 members on 1 and on 3 devices, 2 on each: the same episodes, and padding in none."""
-    spec = spec_of("inverted_pendulum", seeds=(0, 1, 2, 3, 4))
-    write_run(folder / "evaluated", spec)
-    agents, shards = load_agents(folder / "evaluated"), []
-    make_env = evaluation.make_env
+    spec, played = spec_of("inverted_pendulum", seeds=(0, 1, 2, 3, 4)), []
+    agents = Agents(folder, spec, {"actor": {"value": np.arange(5, dtype=np.float32)}})
+    task = TaskSpec("fake/falling", "Falling", 1, "fake_simulators:Falling", "")
 
-    def watched(*arguments, **options):
-        shards.append(make_env(*arguments, **options))
-        return shards[-1]
+    def make_env(spec, workers, timeout, shards):
+        played.append(HostEnv([task], 5, 32, 2, 1, workers=2, shards=shards))
+        return played[-1]
 
-    evaluation.make_env = watched
-    one, three = (evaluation.evaluate(agents, 1, devices=devices) for devices in (1, 3))
-    evaluation.make_env = make_env
-    assert [env.shards for env in shards] == [1, 3]
-    assert len(one) == len(three) == 5
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "make_agent", lambda spec: Small(spec.config, 1))
+        patch.setattr(evaluation, "make_env", make_env)
+        one, three = (evaluation.evaluate(agents, 1, devices=devices) for devices in (1, 3))
+    assert [env.shards for env in played] == [1, 3]
+    assert len(one) == len(three) == len({row["return"] for row in one}) == 5
     for row, other in zip(one, three, strict=True):
         assert other.pop("return") == pytest.approx(row.pop("return"), rel=1e-3)
         assert other == row

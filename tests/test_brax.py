@@ -28,7 +28,7 @@ from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
 from dreamer_jax.device_round import whole_round
 from dreamer_jax.diagnosis import diagnose
-from dreamer_jax.population import init_members, update_members, zero_sums
+from dreamer_jax.population import update_members, zero_sums
 from dreamer_jax.rollout import collect
 from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
@@ -564,7 +564,7 @@ def programs(brax_pixels):
     agent = Agent(preset("debug"), 1)
     pendula = [SWINGUP, "brax/inverted_double_pendulum"]
     made = envs.make(pendula, members=1, image_size=32)
-    state = jax.eval_shape(lambda: init_members(agent, jnp.arange(1)))
+    state = jax.eval_shape(jax.vmap(agent.init), jnp.arange(1))
     sums = jax.eval_shape(lambda: zero_sums(agent, state, 2, 5))
     held = jax.eval_shape(lambda: device_replay.empty(1, 2, 42, 32, 1))
 

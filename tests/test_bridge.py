@@ -20,10 +20,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
+from dreamer_jax import rollout
+from dreamer_jax.config import preset
+from dreamer_jax.records import Records
 from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv, Token
 from envs.pool import hosted_slots
+from small_agent import Small
 
 KEY = jax.random.key(0)
 
@@ -564,6 +569,44 @@ def test_workers_end_when_the_environment_is_closed_and_it_says_so_afterwards():
     programs(env).reset(0, KEY)
     with pytest.raises(SimulatorError, match="closed"):
         env.check()
+
+
+def played(env) -> Records:
+    """A phase of 4 ticks by 2 members."""
+    agent, seeds = Small(preset("debug"), 2), jnp.arange(2, dtype=jnp.int32)
+    records = rollout.collect(
+        agent, env, {"actor": {"value": jnp.ones(2)}}, seeds, seeds, jnp.int32(0), tasks=1, ticks=4,
+        mode="explore",
+    )  # fmt: skip
+    records = jax.tree.map(np.asarray, records)
+    env.check()
+    return records
+
+
+def test_environments_made_one_after_the_other_share_the_program_of_a_phase():
+    with env_of(fake("Counting"), members=2) as counting:
+        assert not played(counting).terminal.any()
+        with env_of(fake("Falling"), members=2) as beside:
+            falls = played(beside).terminal
+            assert falls[:, 0].tolist() == [[False, False, False, True, False]] * 2
+            # Each has its own simulators, and so its own program, while both are open.
+            assert not played(counting).terminal.any()
+            assert counting.program is not beside.program
+        programs = rollout._collect._cache_size()
+    with env_of(fake("Falling"), members=2) as first, env_of(fake("Counting"), members=2) as second:
+        assert_array_equal(played(first).terminal, falls)
+        assert not played(second).terminal.any()
+    assert rollout._collect._cache_size() == programs
+
+
+def test_an_environment_that_is_closed_plays_no_other_ones_simulators():
+    with env_of(fake("Counting"), members=2) as env:
+        played(env)
+    with env_of(fake("Falling"), members=2) as other:
+        played(other)
+        with pytest.raises(SimulatorError, match="closed"):
+            played(env)
+        assert played(other).terminal.any()
 
 
 SCRIPT_WITHOUT_GUARD = """

@@ -1,11 +1,10 @@
 """Fine-tuning and frozen sources: what of a source is taken over, and what of it trains."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer_jax.population import init_program
+from dreamer_jax.population import init_members, init_program
 from experiments.runs.agents import make_agent
 from experiments.runs.start import load_sources, transferred_members
 from runs import batch_for, spec_of, write_run
@@ -46,7 +45,7 @@ def test_everything_is_copied_where_shapes_fit(sources, method, source, fresh):
     state, report = transferred_members(spec, read)
     given = bits(read.agents[0].params)
     from_scratch = make_agent(spec_of("hopper")).on_any_schedule()
-    drawn = init_program()(from_scratch, jnp.array(spec.seeds)).params
+    drawn = init_members(from_scratch, spec.seeds).params
     for place in range(2):
         target, scratch = bits(member(state.params, place)), bits(member(drawn, place))
         assert {path for path in target if target[path] != given[path]} == fresh

@@ -17,10 +17,11 @@ from experiments.cli.selection import Sweep
 from experiments.reports.classification import read_classification
 from experiments.reports.outcomes import read_outcomes
 from experiments.runs.folder import folders, latents_folder
-from experiments.thesis import grid, latent_tables
+from experiments.thesis import grid, latent_tables, measurement
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, shown
 from runs import CONFIG, finish, write_run
+from small_agent import Small
 
 pytest.importorskip("pybullet")
 
@@ -182,7 +183,10 @@ def test_damaged_samples_are_named_with_the_way_out(classified, tmp_path):
         latent_tables.make_table(tmp_path / "debug", TABLES["table-13"], 0)
 
 
-def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, capsys):
+def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, monkeypatch, tmp_path, capsys):
+    # This machine is measured, by updates that compile in a moment.
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(measurement, "make_agent", lambda spec: Small(spec.config, 6))
     words = ["plan", "--table", "7", "--preset", "debug", "--seeds", "0", "1"]
     assert main([*words, "--results", str(made)]) == 0
     output = capsys.readouterr().out
@@ -191,6 +195,8 @@ def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, capsys):
     assert "fractional" in lines and "fractional-2" in lines
     assert "cut" not in output and "missing" in output and "done" in output
     assert "An estimate" in output
+    (kept,) = (tmp_path / "dreamer-transfer" / "speed").glob("*.json")
+    assert 0 < read_json(kept)["speed"]["update_seconds"] < 60
     assert set(folders(made / "debug")) == set(
         read_json(made / "debug" / SOURCE / "cells.json")
         + read_json(made / "debug" / TARGETS / "cells.json")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import signal
 
 import chex
@@ -227,6 +228,17 @@ def test_a_run_that_deletes_old_records_and_is_killed_goes_on_as_if_it_had_not_b
     metrics = [(tmp_path / name / "metrics.jsonl").read_bytes() for name in ("whole", "killed")]
     assert metrics[0] == metrics[1]
     chex.assert_trees_all_equal(resumed.state, whole.state)
+
+
+def test_a_run_that_goes_on_draws_no_agents_to_throw_them_away(finished, tmp_path, monkeypatch):
+    directory, whole = finished
+    shutil.copytree(directory, tmp_path / "run")
+    monkeypatch.setattr(population, "init_members", None)
+    resumed = run_in(tmp_path / "run", resume=True)
+    resumed.close()
+    chex.assert_trees_all_equal(resumed.state, whole.state)
+    with pytest.raises(TypeError):
+        run_in(tmp_path / "another")
 
 
 def test_a_finished_run_that_is_resumed_changes_nothing(finished):

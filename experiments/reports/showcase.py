@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import envs
@@ -161,7 +160,7 @@ def source_panel(
     ]
     own = (alike or list(source.spec.tasks))[0]
     spec = RunSpec((own,), (0,), source.spec.config)
-    params = jax.tree.map(lambda x: jnp.asarray(x)[None], source.params)
+    params = jax.device_put(jax.tree.map(lambda x: x[None], source.params))
     records = play(Agents(source.directory, spec, params), workers=workers, timeout=timeout)
     score = records.reward[0, 0].sum()
     return Panel(f"source on {own}\nreturn {score:.0f}", records.image[0, 0])

@@ -51,7 +51,7 @@ def load_agents(directory: str | Path) -> Agents:
       ValueError: the folder holds no run or no checkpoint.
     """
     spec = read_spec(directory)
-    return Agents(Path(directory), spec, jax.tree.map(jnp.asarray, load_params(directory)))
+    return Agents(Path(directory), spec, jax.device_put(load_params(directory)))
 
 
 def evaluate(

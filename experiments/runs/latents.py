@@ -123,13 +123,14 @@ def gather(
         action_size=acting.action_size,
         supersample=source.spec.config.schedule.supersample,
     )
+    params = jax.device_put(jax.tree.map(lambda x: np.asarray(x)[None], actor.params))
     found: list[list[Latents]] = [[] for _ in tasks]
     try:
         for phase in range(phases):
             records = collect(
                 acting,
                 env,
-                jax.tree.map(lambda x: jnp.asarray(x)[None], actor.params),
+                params,
                 jnp.array([seed], jnp.int32),
                 jnp.zeros(1, jnp.int32),
                 jnp.int32(LATENT_PHASES[phase]),

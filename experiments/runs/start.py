@@ -9,13 +9,14 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import envs
 import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.devices import Placement, on_one_device
 from dreamer_jax.learning import AgentState
-from dreamer_jax.population import init_over
+from dreamer_jax.population import init_members
 from experiments.methods import Sources
 from experiments.runs.agents import check_source, load_source, make_agent
 from experiments.runs.latents import own_latents
@@ -101,18 +102,16 @@ def transferred_members(
             targets = jax.vmap(chosen)(is_target, targets, fresh)
         return jax.vmap(agent.start)(targets, seeds), report
 
-    seeds = placement.spread(jnp.array([member.seed for member in spec.members], jnp.int32))
+    own_seeds = np.array([member.seed for member in spec.members], np.int32)
     of_members = (
         jnp.arange(members) < count,
         *jax.tree.map(for_all, (own, theirs, parameters)),
     )
     over = placement.over_devices
     # The draws compile longest by far: a program of their own, which all plans of an agent share.
-    draw = init_over(_untouched(agent), placement)
+    fresh = init_members(_untouched(agent), own_seeds).params
     made = jax.jit(over(start, (0, 0, 0, 0, 0, 0, None)), donate_argnums=0)
-    state, report = placement.own(
-        made(draw(seeds).params, seeds, *placement.spread(of_members), shared)
-    )
+    state, report = placement.own(made(*placement.spread((fresh, own_seeds, *of_members)), shared))
     # It is of the targets alone.
     report = jax.tree.map(lambda x: x[:count], report)
     rows = tuple(row._replace(shape=(count, *row.shape[1:])) for row in report.rows)

@@ -72,12 +72,12 @@ def made_up(agent: Agent) -> tuple[AgentState, Records]:
 
     def make(leaf):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
-            return jnp.asarray(random.normal(0, 0.03, leaf.shape), leaf.dtype)
-        return jnp.ones(leaf.shape, leaf.dtype)
+            return random.normal(0, 0.03, leaf.shape).astype(leaf.dtype)
+        return np.ones(leaf.shape, leaf.dtype)
 
     state = jax.tree.map(make, state)
-    optimisers = jax.tree.map(jnp.zeros_like, state.optimisers)
-    state = dataclasses.replace(state, optimisers=optimisers)
+    optimisers = jax.tree.map(np.zeros_like, state.optimisers)
+    state = jax.device_put(dataclasses.replace(state, optimisers=optimisers))
     image = random.integers(0, 256, batch.image.shape, dtype=np.uint8)
     return state, batch.map(lambda x: np.zeros(x.shape, x.dtype))._replace(image=image)
 
