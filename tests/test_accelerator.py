@@ -1,7 +1,7 @@
 """The benchmark of a card: whole, on the CPU and as small as can be, and what becomes of failures.
 
-Of the processes that measure, those of the first part and of the peer that fails are real ones in
-the first tests; they are shell scripts in those on failures.
+Of the processes that measure, that of the peer that fails is a real one; the others are this
+process in the first tests, and shell scripts in those on failures.
 """
 
 import dataclasses
@@ -73,10 +73,10 @@ def measured(tmp_path_factory):
     )
     words = ["accelerator", "--sizes", "debug", "--out", str(folder / "card.json")]
     words += ["--peer", peer, "--peak-tflops", "0.5", "2"]
-    first, popen = parts(SIZES["debug"])[0].name, subprocess.Popen
+    popen = subprocess.Popen
 
     def begun(arguments, **options):
-        measures_here = arguments[:-2] == command.MEASURES and arguments[-2] != first
+        measures_here = arguments[:-2] == command.MEASURES
         return (InThisProcess if measures_here else popen)(arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -156,12 +156,17 @@ def test_a_second_start_measures_what_is_missing_and_nothing_else(measured, monk
     assert main(words) == 0 and not begun
 
 
-def test_figures_of_other_sizes_or_another_card_are_kept_apart(measured, tmp_path, capsys):
+def test_figures_of_other_sizes_or_another_card_are_kept_apart(
+    measured, tmp_path, monkeypatch, capsys
+):
     folder, _ = measured
     words = ["accelerator", "--out", str(folder / "card.json")]
     assert main(words) == 2
     assert "holds sizes debug, thesis were asked for" in capsys.readouterr().err
     values = read(folder / "card.json")
+    here = json.dumps({"machine": {"revision": "r", **values["machine"]}})
+    script = executable(tmp_path / "measures", f"echo '{here}'; exec sleep 60")
+    monkeypatch.setattr(command, "MEASURES", [script])
     values["machine"]["card"], values["rows"] = "another", []
     (tmp_path / "card.json").write_text(json.dumps(values))
     assert main(["accelerator", "--sizes", "debug", "--out", str(tmp_path / "card.json")]) == 2
