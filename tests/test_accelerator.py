@@ -65,6 +65,24 @@ class InThisProcess:
         return self.returncode
 
 
+class FakeUpdates:
+    """Updates of which the device has room for so many members'."""
+
+    room = 4
+    compiled: list[tuple[str, int]] = []
+
+    def __init__(self, config, actions, members, mapping, chunk):
+        self.compiled.append((mapping, chunk))
+        self.working_bytes, self.program_bytes = 100 * chunk, 0
+        self.compile_seconds = 1.0
+        self.chunk = chunk
+
+    def __call__(self):
+        if self.chunk > self.room:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+        return 0.5
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("accelerator")
@@ -73,7 +91,14 @@ def measured(tmp_path_factory):
     )
     words = ["accelerator", "--sizes", "debug", "--out", str(folder / "card.json")]
     words += ["--peer", peer, "--peak-tflops", "0.5", "2"]
-    popen = subprocess.Popen
+    popen, real, made_up = subprocess.Popen, measures.Updates, []
+
+    def updates(config, *arguments):
+        """Of one precision they are real, for another program of updates takes seconds more."""
+        if config.network.precision == "float32":
+            return real(config, *arguments)
+        made_up.append(config.network.precision)
+        return FakeUpdates(config, *arguments)
 
     def begun(arguments, **options):
         measures_here = arguments[:-2] == command.MEASURES
@@ -81,7 +106,9 @@ def measured(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(subprocess, "Popen", begun)
+        patch.setattr(measures, "Updates", updates)
         assert main(words) == 0
+    assert made_up == ["bfloat16"]
     return folder, words
 
 
@@ -265,24 +292,6 @@ def test_without_pytorch_the_peer_is_skipped_in_words_and_nothing_is_begun(
 
 
 # What a process measures.
-
-
-class FakeUpdates:
-    """Updates of which the device has room for so many members'."""
-
-    room = 4
-    compiled: list[tuple[str, int]] = []
-
-    def __init__(self, config, actions, members, mapping, chunk):
-        self.compiled.append((mapping, chunk))
-        self.working_bytes, self.program_bytes = 100 * chunk, 0
-        self.compile_seconds = 1.0
-        self.chunk = chunk
-
-    def __call__(self):
-        if self.chunk > self.room:
-            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
-        return 0.5
 
 
 def update_part(monkeypatch, limit):

@@ -59,8 +59,7 @@ SIZES = {
         rollouts=(2,),
         ticks=20,
         seconds=0.0,
-        # As many as the run that learns has, so that both have a replay of one size, one program.
-        rounds=3,
+        rounds=1,
         turns=1,
         learning="debug",
         seeds=(0,),
