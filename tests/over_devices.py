@@ -6,21 +6,24 @@ held by the real update too. Axis letters as in dreamer_jax.
 """
 
 import dataclasses
+import functools
 import json
 import sys
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
 from accidents import Killed
-from dreamer_jax import population
+from dreamer_jax import training
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
 from dreamer_jax.config import preset
+from dreamer_jax.device_round import DeviceRounds
 from dreamer_jax.devices import Placement, place
 from dreamer_jax.logs import read_metrics
 from dreamer_jax.population import Member, Population
@@ -28,6 +31,7 @@ from dreamer_jax.training import Run
 from envs.base import TaskSpec
 from envs.bridge import HostEnv
 from experiments.runs import evaluate as evaluation
+from experiments.runs import start as beginning
 from experiments.runs.evaluate import Agents
 from experiments.runs.start import load_sources, transferred_members
 from probes import Inside
@@ -36,6 +40,18 @@ from small_agent import Small
 
 DEBUG = preset("debug")
 TASKS = ("probe/left", "probe/right")
+
+
+@functools.cache
+def population(agent, env, tasks, seeds, placement):
+    return Population(agent, env, tasks, seeds, placement)
+
+
+def shared_population(agent, env, tasks, seeds, placement):
+    """Runs whose members lie alike share a population, and so what it has compiled: their agents
+    differ in what a population does not ask about."""
+    assert agent.on_any_schedule() == AGENT.on_any_schedule()
+    return population(AGENT, env, tasks, tuple(seeds), placement)
 
 
 def config_with(**schedule):
@@ -49,21 +65,46 @@ def config_with(**schedule):
     return dataclasses.replace(DEBUG, schedule=dataclasses.replace(DEBUG.schedule, **settings))
 
 
+AGENT = Small(config_with(), 2)
+
+
 def made(directory, members, devices, agent, make_env, resume=False):
     """A run of members on as many devices."""
     placement = place(members, devices)
     names = tuple(Member(seed, f"agent {seed}") for seed in range(members))
     env = make_env(members, placement.count)
     options = {"videos": 0, "placement": placement, "resume": resume}
-    return Run(agent, env, TASKS, names, directory, **options)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "Population", shared_population)
+        return Run(agent, env, TASKS, names, directory, **options)
 
 
+@contextmanager
+def killed(owner, name, calls):
+    """Within, the given call of a method is where the process is killed."""
+    method, left = getattr(owner, name), [calls]
+
+    def killing(self, *arguments):
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+        return method(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, killing)
+        with pytest.raises(Killed):
+            yield
+
+
+# Runs on as many devices share their environment, and so the programs that have it inside.
+@functools.cache
 def probe(members, shards):
     env = Inside()
     env.shards = shards
     return env
 
 
+@functools.cache
 def counting(members, shards):
     """Simulators on the host that count, and fall."""
     task = TaskSpec("fake/falling", "Falling", 2, "fake_simulators:Falling", "")
@@ -74,7 +115,6 @@ def trained(*arguments, **options):
     run = made(*arguments, **options)
     assert run.train() == "finished"
     run.close()
-    run.env.close()
     return run
 
 
@@ -113,7 +153,7 @@ def the_number_of_devices_does_not_matter(folder):
         ("host-beside", "device", counting, "beside"),
     ):
         agent = Small(config_with(replay=replay, collect=collect), 2)
-        for devices in (1, 2, 8) if name == "files" else (1, 8):
+        for devices in {"files": (1, 2, 8), "device": (1, 4)}.get(name, (1, 8)):
             run = trained(folder / f"{name}-{devices}", 8, devices, agent, make_env)
             assert run.placement.count == devices and run.counters.updates == 12
             if devices > 1:
@@ -156,41 +196,35 @@ def padding_is_nowhere_to_be_seen(folder):
 
 
 def killed_on_many_devices_a_run_goes_on_with_fewer(folder):
-    for members, fewer in ((8, 2), (7, 1)):
+    """To one of eight; and to two of four, which both are made up to an eighth member."""
+    for members, many, fewer in ((8, 8, 1), (7, 4, 2)):
         agent = Small(config_with(checkpoint_every=40), 2)
         directory = folder / f"killed-{members}"
-        run, spread, left = made(directory, members, 8, agent, probe), Population.update, [9]
-
-        def killing(self, *arguments, left=left, spread=spread):
-            left[0] -= 1
-            if left[0] == 0:
-                raise Killed
-            return spread(self, *arguments)
-
-        population.Population.update = killing
-        try:
+        run = made(directory, members, many, agent, probe)
+        with killed(Population, "update", 9):
             run.train()
-        except Killed:
-            run.close()
-        finally:
-            population.Population.update = spread
-        assert left == [0]
+        run.close()
         resumed = trained(directory, members, fewer, agent, probe, resume=True)
         assert resumed.counters.updates == 12
         assert_alike(directory, folder / "files-1", count=members)
 
 
 def a_replay_on_the_devices_is_filled_from_files_of_another_number(folder):
-    agent = Small(config_with(replay="device"), 2)
-    shorter = Small(config_with(replay="device", environment_steps=160), 2)
-    trained(folder / "longer", 8, 4, shorter, probe)
-    trained(folder / "longer", 8, 2, agent, probe, resume=True)
-    assert_alike(folder / "longer", folder / "device-1")
+    agent = Small(config_with(replay="device", checkpoint_every=40), 2)
+    for before, after in ((4, 1), (1, 4)):
+        directory = folder / f"filled-{after}"
+        run = made(directory, 8, before, agent, probe)
+        with killed(DeviceRounds, "run", 3):
+            run.train()
+        run.close()
+        resumed = trained(directory, 8, after, agent, probe, resume=True)
+        assert resumed.counters.updates == 12
+        assert_alike(directory, folder / "device-1")
 
 
 def the_real_update_is_the_same_on_a_device_of_its_own(folder):
+    """Of two members, each on a device, as of each where there is no other: the same to the bit."""
     agent = Agent(DEBUG, 2)
-    batch, results = batch_for(agent, 2), []
     fresh = jax.tree.map(lambda x: np.zeros((2, *x.shape), x.dtype), jax.eval_shape(agent.init, 0))
     states = dataclasses.replace(
         fresh,
@@ -198,14 +232,22 @@ def the_real_update_is_the_same_on_a_device_of_its_own(folder):
         seed=np.arange(2, dtype=np.int32),
         healthy=np.ones(2, bool),
     )
-    for devices in (1, 2):
-        members = Population(agent, None, 1, [3, 4], place(2, devices))
-        state = members.put(jax.tree.map(jnp.array, states))
-        results.append(members.update(state, members.zero_sums(state), batch))
-    assert results[0][0].healthy.all() and results[0][0].updates.tolist() == [1, 1]
-    assert_spread(results[1], place(2, 2))
-    for one, two in zip(*map(jax.tree.leaves, results), strict=True):
-        np.testing.assert_allclose(np.asarray(two), np.asarray(one), rtol=1e-3, atol=1e-5)
+    given = (states, batch_for(agent, 2))
+
+    def updated(numbers, devices):
+        count = len(numbers)
+        members = Population(agent, None, 1, [3, 4][:count], place(count, devices))
+        state, batch = jax.tree.map(lambda x: x[numbers], given)
+        state = members.put(state if devices > 1 else jax.device_put(state))
+        return members.update(state, members.zero_sums(state), batch)
+
+    both = updated([0, 1], 2)
+    assert both[0].healthy.all() and both[0].updates.tolist() == [1, 1]
+    assert_spread(both, place(2, 2))
+    for member in range(2):
+        alone = updated([member], 1)
+        for one, two in zip(*map(jax.tree.leaves, (alone, both)), strict=True):
+            np.testing.assert_array_equal(np.asarray(two)[member], np.asarray(one)[0])
 
 
 def agents_are_evaluated_on_their_devices_as_on_one(folder):
@@ -241,12 +283,12 @@ def targets_begin_on_their_own_devices_as_on_one(folder):
     stored = (folder / "hopper", folder / "ant")
     meta = {"sources": (folder / "uae",), "reward_sources": stored, "method": "meta"}
     for spec in (
-        spec_of("ant", sources=sources, omegas=(0.0, 0.2), baseline=True),
+        spec_of("walker2d", sources=sources, omegas=(0.0, 0.2), baseline=True),
         spec_of("walker2d", seeds=(0, 1, 2), **meta),
     ):
         read, placement = load_sources(spec), place(len(spec.members), 2)
         assert placement.padded == len(spec.members) + 1
-        state, report = transferred_members(spec, read, placement=place(len(spec.members), 1))
+        (state, report), _ = transferred_and_made(spec, read, place(len(spec.members), 1))
         (other, told), made = transferred_and_made(spec, read, placement)
         # What devices made was divided among them before it came to the host.
         assert_spread(made, placement)
@@ -259,11 +301,15 @@ def targets_begin_on_their_own_devices_as_on_one(folder):
 def transferred_and_made(spec, sources, placement):
     """The members of a transfer and its report, and what the devices made of them."""
     made, own = [], Placement.own
-    Placement.own = lambda self, tree: made.append(tree) or own(self, tree)
-    try:
+
+    def fresh(agent, seeds):
+        # Drawn by NumPy: the program that draws takes seconds to compile, and is one device's.
+        return SimpleNamespace(params=random_members(agent, seeds))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Placement, "own", lambda self, tree: made.append(tree) or own(self, tree))
+        patch.setattr(beginning, "init_members", fresh)
         found = transferred_members(spec, sources, placement=placement)
-    finally:
-        Placement.own = own
     (tree,) = made
     return found, tree
 
@@ -293,3 +339,5 @@ if __name__ == "__main__":
     for law in LAWS:
         law(Path(sys.argv[1]))
         print(law.__name__, flush=True)
+    for members, shards in ((8, 1), (8, 8), (7, 4)):
+        counting(members, shards).close()

@@ -1,7 +1,7 @@
 """The benchmark of a card: whole, on the CPU and as small as can be, and what becomes of failures.
 
-Of the processes that measure, those of the first part and of the peer that fails are real ones in
-the first tests; they are shell scripts in those on failures.
+Of the processes that measure, that of the peer that fails is a real one; the others are this
+process in the first tests, and shell scripts in those on failures.
 """
 
 import dataclasses
@@ -65,6 +65,24 @@ class InThisProcess:
         return self.returncode
 
 
+class FakeUpdates:
+    """Updates of which the device has room for so many members'."""
+
+    room = 4
+    compiled: list[tuple[str, int]] = []
+
+    def __init__(self, config, actions, members, mapping, chunk):
+        self.compiled.append((mapping, chunk))
+        self.working_bytes, self.program_bytes = 100 * chunk, 0
+        self.compile_seconds = 1.0
+        self.chunk = chunk
+
+    def __call__(self):
+        if self.chunk > self.room:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+        return 0.5
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("accelerator")
@@ -73,15 +91,24 @@ def measured(tmp_path_factory):
     )
     words = ["accelerator", "--sizes", "debug", "--out", str(folder / "card.json")]
     words += ["--peer", peer, "--peak-tflops", "0.5", "2"]
-    first, popen = parts(SIZES["debug"])[0].name, subprocess.Popen
+    popen, real, made_up = subprocess.Popen, measures.Updates, []
+
+    def updates(config, *arguments):
+        """Of one precision they are real, for another program of updates takes seconds more."""
+        if config.network.precision == "float32":
+            return real(config, *arguments)
+        made_up.append(config.network.precision)
+        return FakeUpdates(config, *arguments)
 
     def begun(arguments, **options):
-        measures_here = arguments[:-2] == command.MEASURES and arguments[-2] != first
+        measures_here = arguments[:-2] == command.MEASURES
         return (InThisProcess if measures_here else popen)(arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(subprocess, "Popen", begun)
+        patch.setattr(measures, "Updates", updates)
         assert main(words) == 0
+    assert made_up == ["bfloat16"]
     return folder, words
 
 
@@ -156,12 +183,17 @@ def test_a_second_start_measures_what_is_missing_and_nothing_else(measured, monk
     assert main(words) == 0 and not begun
 
 
-def test_figures_of_other_sizes_or_another_card_are_kept_apart(measured, tmp_path, capsys):
+def test_figures_of_other_sizes_or_another_card_are_kept_apart(
+    measured, tmp_path, monkeypatch, capsys
+):
     folder, _ = measured
     words = ["accelerator", "--out", str(folder / "card.json")]
     assert main(words) == 2
     assert "holds sizes debug, thesis were asked for" in capsys.readouterr().err
     values = read(folder / "card.json")
+    here = json.dumps({"machine": {"revision": "r", **values["machine"]}})
+    script = executable(tmp_path / "measures", f"echo '{here}'; exec sleep 60")
+    monkeypatch.setattr(command, "MEASURES", [script])
     values["machine"]["card"], values["rows"] = "another", []
     (tmp_path / "card.json").write_text(json.dumps(values))
     assert main(["accelerator", "--sizes", "debug", "--out", str(tmp_path / "card.json")]) == 2
@@ -260,24 +292,6 @@ def test_without_pytorch_the_peer_is_skipped_in_words_and_nothing_is_begun(
 
 
 # What a process measures.
-
-
-class FakeUpdates:
-    """Updates of which the device has room for so many members'."""
-
-    room = 4
-    compiled: list[tuple[str, int]] = []
-
-    def __init__(self, config, actions, members, mapping, chunk):
-        self.compiled.append((mapping, chunk))
-        self.working_bytes, self.program_bytes = 100 * chunk, 0
-        self.compile_seconds = 1.0
-        self.chunk = chunk
-
-    def __call__(self):
-        if self.chunk > self.room:
-            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
-        return 0.5
 
 
 def update_part(monkeypatch, limit):
