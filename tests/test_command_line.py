@@ -35,7 +35,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     directory = tmp_path_factory.mktemp("whole") / "run"
-    run(*TRAIN, "--out", directory)
+    run(*TRAIN, "--workers", "1", "--out", directory)
     return directory
 
 
