@@ -32,6 +32,8 @@ PART = ["table", "7", "--preset", "debug", "--seeds", "0", "1", "--counts", "2"]
 PART += ["--omegas", "0", "0.2", "--workers", "1"]
 TABLE = dataclasses.replace(TABLES["table-7"], counts=(2,), omegas=(0.0, 0.2))
 META = dataclasses.replace(TABLES["table-16"], targets=("InvertedPendulum",), counts=(2,))
+FEW = 30
+"""Latent states of each task, of the hundred that are gathered for a table."""
 
 
 @pytest.fixture(scope="module")
@@ -166,18 +168,22 @@ def classified(tmp_path_factory):
     (run,) = plan_runs([cell], CONFIG, root)
     finish(run, root)
     write_run(root / run.name, run.spec, keep=True)
-    latent_tables.make_table(root, TABLES["table-13"], 0, workers=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(latent_tables, "SAMPLES", FEW)
+        latent_tables.make_table(root, TABLES["table-13"], 0, workers=1)
     return root
 
 
 def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatch, written):
+    assert latent_tables.SAMPLES == 100
+    monkeypatch.setattr(latent_tables, "SAMPLES", FEW)
     monkeypatch.setattr(latent_tables, "gather", None)
     sweep = Sweep("debug", results=classified.parent, config=CONFIG)
     entries = [TABLES[f"table-{number}"] for number in (13, 14, 15)]
     assert thesis._make(entries, sweep, Execution()) == 0
     for entry in entries:
         found = read_classification(classified, entry)
-        assert (found.samples, found.feature_size) == (100, 12)
+        assert (found.samples, found.feature_size) == (FEW, 12)
         assert len(found.shares) == 4 * 6
         assert (latents_folder(classified, "bullet", 0) / f"{entry.name}.png").exists()
 
@@ -218,6 +224,7 @@ def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, monkeypatch, tm
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(measurement, "make_agent", lambda spec: Small(spec.config, 6))
     monkeypatch.setattr(measurement, "UPDATE_SECONDS", 0.02)
+    monkeypatch.setattr(measurement, "TICKS", 5)
     words = ["plan", "--table", "7", "--preset", "debug", "--seeds", "0", "1"]
     assert main([*words, "--results", str(made)]) == 0
     output = capsys.readouterr().out
