@@ -17,6 +17,10 @@ ARGS   ?=
 
 GRID    = --preset $(PRESET) --seeds $(SEEDS) --backend $(BACKEND) --results $(RESULTS)
 
+# Every command starts processes that import the same modules, which are compiled once if that is
+# kept: an empty value means that it may be.
+export PYTHONDONTWRITEBYTECODE :=
+
 VENV   := .venv
 RUN    := $(VENV)/bin/python
 STAMP   = $(VENV)/.installed-
@@ -76,7 +80,7 @@ $(VENV)/.weights: $(STAMP)bullet+brax+gymnasium+dev$(ON)
 	@$(RUN) -m pip install --quiet --disable-pip-version-check --no-deps silero-vad==6.2.3
 	@touch $@
 
-test: $(STAMP)bullet+brax+gymnasium+dev$(ON) $(VENV)/.weights  ## Run the test suite (10 to 15 minutes)
+test: $(STAMP)bullet+brax+gymnasium+dev$(ON) $(VENV)/.weights  ## Run the test suite (8 minutes)
 	$(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(STAMP)bullet+brax+gymnasium+dev$(ON)  ## Check style and types

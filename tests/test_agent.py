@@ -99,10 +99,10 @@ def test_updates_lower_the_losses_on_one_repeated_batch(update, state):
     batch = batch._replace(image=np.full_like(batch.image, 255))
     _, before = update(state, batch)
     history = []
-    for _ in range(150):
+    for _ in range(100):
         state, metrics = update(state, batch)
         history.append((metrics["image_loss"], metrics["reward_loss"]))
-    image, reward = np.mean(history[-50:], axis=0)
+    image, reward = np.mean(history[-30:], axis=0)
     assert image < 0.5 * before["image_loss"]
     assert reward < 0.9 * before["reward_loss"]
 
@@ -430,14 +430,26 @@ def test_entropys_weight_pulls_an_actor_towards_even_odds(with_choices):
     assert np.log(3) - entropies[-1] < 0.2 * (np.log(3) - entropies[0])
 
 
-def test_entropys_weight_spreads_continuous_actions_over_their_range(state):
+def test_entropys_weight_spreads_continuous_actions_over_their_range(state, observe):
     # A squashed Gaussian comes nearest to the uniform distribution, whose entropy is log 2 for
     # each of the A actions, at a spread of about 0.9.
-    agent = Agent(with_settings("learning", entropy_scale=100.0, actor_learning_rate=3e-2), A)
-    state, batch, update = agent.start(state.params, 0), batch_of(), jax.jit(agent.update)
-    history = []
-    for _ in range(80):
-        state, metrics = update(state, batch)
+    agent = Agent(with_settings("learning", entropy_scale=100.0), A)
+    posterior, _, _ = observe(state.params, batch_of(), jax.random.key(0))
+    optimiser = optax.adam(3e-2)
+
+    @jax.jit
+    def learn(actor, moments, key):
+        def loss(actor):
+            return behaviour_loss(agent, {"actor": actor}, state.params, posterior, key)
+
+        gradient, metrics = jax.grad(loss, has_aux=True)(actor)
+        changes, moments = optimiser.update(gradient, moments)
+        return optax.apply_updates(actor, changes), moments, metrics
+
+    actor, history = state.params["actor"], []
+    moments = optimiser.init(actor)
+    for key in jax.random.split(jax.random.key(1), 100):
+        actor, moments, metrics = learn(actor, moments, key)
         history.append((metrics["actor_entropy"], metrics["actor_std"]))
     (entropy, std), (last_entropy, last_std) = history[0], history[-1]
     assert entropy < 0 and std > 3, "an actor begins with nearly all actions at their limits"

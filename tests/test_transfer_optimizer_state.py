@@ -1,5 +1,7 @@
 """The memory of an optimiser moved by the plan of the parameters."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ ADAM = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(1e-2))
 SOURCE = {"enc": {"w": jnp.ones((3, 2)), "b": jnp.ones(2)}, "out": {"w": jnp.ones((2, 4))}}
 
 
+@functools.partial(jax.jit, static_argnames=("optimizer", "steps"))
 def trained(optimizer, params, steps=3):
     state = optimizer.init(params)
     for step in range(steps):
