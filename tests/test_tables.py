@@ -6,18 +6,19 @@ import shutil
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import envs
 from dreamer_jax.files import read_json
-from dreamer_jax.logs import read_metrics
 from experiments.cli import reports, thesis
 from experiments.cli.engines import Execution
 from experiments.cli.main import main
 from experiments.cli.selection import Sweep
 from experiments.reports.classification import read_classification
 from experiments.reports.outcomes import read_outcomes
+from experiments.runs.agents import load_source
 from experiments.runs.folder import folders, latents_folder
-from experiments.thesis import grid, latent_tables, measurement
+from experiments.thesis import grid, jobs, latent_tables, measurement
 from experiments.thesis.graph import plan_runs
 from experiments.thesis.grid import TABLES, shown
 from runs import CONFIG, finish, write_run
@@ -28,16 +29,30 @@ pytest.importorskip("pybullet")
 SOURCE = "bullet-HalfCheetah+InvertedDoublePendulum-seed-0"
 TARGETS = "bullet-InvertedPendulum-fractional"
 PART = ["table", "7", "--preset", "debug", "--seeds", "0", "1", "--counts", "2"]
-PART += ["--omegas", "0", "0.2"]
+PART += ["--omegas", "0", "0.2", "--workers", "1"]
 TABLE = dataclasses.replace(TABLES["table-7"], counts=(2,), omegas=(0.0, 0.2))
 META = dataclasses.replace(TABLES["table-16"], targets=("InvertedPendulum",), counts=(2,))
+FEW = 30
+"""Latent states of each task, of the hundred that are gathered for a table."""
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """The folder of results in which a part of Table 7 was made."""
-    results = tmp_path_factory.mktemp("results")
-    assert main([*PART, "--results", str(results)]) == 0
+    """The folder of results in which a part of Table 7 was made, its source in a moment."""
+    results, trained = tmp_path_factory.mktemp("results"), []
+
+    def train(run, root, means):
+        trained.append(run.name)
+        if run.spec.method.sources:
+            return jobs.train(run, root, means)
+        finish(run, root)
+        write_run(root / run.name, run.spec, keep=True)
+        return "finished"
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "_train", train)
+        assert main([*PART, "--results", str(results)]) == 0
+    assert trained == [SOURCE, TARGETS]
     return results
 
 
@@ -97,12 +112,14 @@ def test_a_table_and_a_figure_of_agents_that_are_there_train_nothing(made, root,
     assert {outcome.state for outcome in outcomes.values()} == {"done"}
 
 
-def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(made, written, tmp_path):
+def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(
+    made, written, tmp_path, monkeypatch
+):
     root = tmp_path / "debug"
     shutil.copytree(made / "debug", root)
     runs = plan_runs(shown(META, (0, 1)), CONFIG, root)
     *sources, targets = [run for run in runs if run.state == "missing"]
-    # Made in a moment: what is trained here is the population of targets.
+    # Made in a moment: what is begun here, on their models, is the population of targets.
     for seed, run in enumerate(sources):
         spec = run.spec
         if spec.method.sources:
@@ -111,12 +128,27 @@ def test_a_table_of_meta_models_is_made_from_the_agents_it_needs(made, written, 
             spec = dataclasses.replace(spec, method=method)
         finish(run, root)
         write_run(root / run.name, spec, seed, keep=True)
+    begun = []
+
+    def train_in_a_moment(run, ways):
+        begun.append(([member.label for member in run.members], run.state.params["reward"]))
+        run.close()
+        run.env.close()
+        finish(targets, root)
+        return "finished"
+
+    monkeypatch.setattr(jobs, "carry_out", train_in_a_moment)
     sweep = Sweep("debug", (0, 1), results=tmp_path, config=CONFIG)
     assert thesis._make([META], sweep, Execution()) == 0
     assert len(targets.cells) == 2
+    ((labels, reward),) = begun
+    assert labels == ["sources=2"] * 2
+    assert reward["stored"]["present"].sum(axis=1).tolist() == [2, 2]
+    for place, name in enumerate(targets.spec.method.stored):
+        stored = load_source(root / name).params["reward"]["out"]["kernel"]
+        assert_array_equal(reward["stored"]["params"]["out"]["kernel"][:, place], [stored] * 2)
     outcomes = read_outcomes(root, shown(META, (0, 1)))
     assert {outcome.state for outcome in outcomes.values()} == {"done"}
-    assert {row["label"] for row in read_metrics(root / targets.name)} == {"sources=2"}
 
 
 def test_a_report_of_all_results_is_of_what_there_is_something_of(root, written):
@@ -136,18 +168,22 @@ def classified(tmp_path_factory):
     (run,) = plan_runs([cell], CONFIG, root)
     finish(run, root)
     write_run(root / run.name, run.spec, keep=True)
-    latent_tables.make_table(root, TABLES["table-13"], 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(latent_tables, "SAMPLES", FEW)
+        latent_tables.make_table(root, TABLES["table-13"], 0, workers=1)
     return root
 
 
 def test_latent_states_are_gathered_once_for_three_tables(classified, monkeypatch, written):
+    assert latent_tables.SAMPLES == 100
+    monkeypatch.setattr(latent_tables, "SAMPLES", FEW)
     monkeypatch.setattr(latent_tables, "gather", None)
     sweep = Sweep("debug", results=classified.parent, config=CONFIG)
     entries = [TABLES[f"table-{number}"] for number in (13, 14, 15)]
     assert thesis._make(entries, sweep, Execution()) == 0
     for entry in entries:
         found = read_classification(classified, entry)
-        assert (found.samples, found.feature_size) == (100, 12)
+        assert (found.samples, found.feature_size) == (FEW, 12)
         assert len(found.shares) == 4 * 6
         assert (latents_folder(classified, "bullet", 0) / f"{entry.name}.png").exists()
 
@@ -187,6 +223,8 @@ def test_a_plan_shows_runs_and_says_that_it_is_an_estimate(made, monkeypatch, tm
     # This machine is measured, by updates that compile in a moment.
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(measurement, "make_agent", lambda spec: Small(spec.config, 6))
+    monkeypatch.setattr(measurement, "UPDATE_SECONDS", 0.02)
+    monkeypatch.setattr(measurement, "TICKS", 5)
     words = ["plan", "--table", "7", "--preset", "debug", "--seeds", "0", "1"]
     assert main([*words, "--results", str(made)]) == 0
     output = capsys.readouterr().out
