@@ -51,9 +51,7 @@ def runs(source):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StopRequest, "__enter__", stopped)
-        # As many as there are targets, which are drawn by the same program.
-        words = ("--method", "uae", "--seeds", 0, 1)
-        train(runs / TASKS[0], TASKS[0], *words, *on, code=STOPPED)
+        train(runs / TASKS[0], TASKS[0], "--method", "uae", *on, code=STOPPED)
     write_run(runs / TASKS[1], spec_of(TASKS[1], method="uae", sources=[source]), seed=1)
     train(
         runs / "target", TASKS[0], "--method", "meta", *on,
