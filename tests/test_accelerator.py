@@ -1,7 +1,7 @@
 """The benchmark of a card: whole, on the CPU and as small as can be, and what becomes of failures.
 
-Of the processes that measure, that of the peer that fails is a real one; the others are this
-process in the first tests, and shell scripts in those on failures.
+Of the processes that measure, those of the first part and of the peer that fails are real ones; the
+others are this process in the first tests, and shell scripts in those on failures.
 """
 
 import dataclasses
@@ -91,6 +91,7 @@ def measured(tmp_path_factory):
     )
     words = ["accelerator", "--sizes", "debug", "--out", str(folder / "card.json")]
     words += ["--peer", peer, "--peak-tflops", "0.5", "2"]
+    first = parts(SIZES["debug"])[0].name
     popen, real, made_up = subprocess.Popen, measures.Updates, []
 
     def updates(config, *arguments):
@@ -101,7 +102,7 @@ def measured(tmp_path_factory):
         return FakeUpdates(config, *arguments)
 
     def begun(arguments, **options):
-        measures_here = arguments[:-2] == command.MEASURES
+        measures_here = arguments[:-2] == command.MEASURES and arguments[-2] != first
         return (InThisProcess if measures_here else popen)(arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
