@@ -112,6 +112,7 @@ def collect(
       Records with leading axes [P, K, T + 1].
     """
     number = jnp.int32(MODES.index(mode)) if isinstance(mode, str) else mode
+    # A program that this is a part of is one of the environment itself.
     if not isinstance(seeds, jax.core.Tracer):
         env = getattr(env, "program", env)
     return _collect(

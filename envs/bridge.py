@@ -110,7 +110,43 @@ def _host_results(ticks: np.ndarray, time_step: TimeStep) -> tuple[np.ndarray, n
     return time_step.image, row
 
 
-class HostSlots:
+def _results(image_size: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
+    """What the host answers for one slot: the image, and the words of `_host_results`."""
+    image = jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8)
+    return image, jax.ShapeDtypeStruct((4,), jnp.int32)
+
+
+class HostProgram:
+    """What a program holds of host simulators: calls of the functions that answer for them.
+
+    Args:
+      image_size, action_size: see `HostEnv`.
+      reset, step: on the host, of rows of words; they raise nothing.
+    """
+
+    has_host = True
+
+    def __init__(self, image_size: int, action_size: int, reset: Callable, step: Callable):
+        self.image_size, self.action_size = image_size, action_size
+        results = _results(image_size)
+        self._call_reset, self._call_step = on_host(reset, results), on_host(step, results)
+
+    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
+        """Put a new simulator, seeded by `key` (typed or raw), into `slot` (int32 []).
+
+        Map over `slot`, whatever else is mapped: with nothing mapped all members would share
+        one simulator.
+        """
+        row = key_words(slot, key)
+        return _time_step(row[0], *self._call_reset(row))
+
+    def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
+        """One tick with `action` (float32 [A], clipped to [-1, 1], or one-hot)."""
+        row = action_words(state, action, self.action_size)
+        return _time_step(state.slot, *self._call_step(row))
+
+
+class HostSlots(HostProgram):
     """Host simulators as compiled programs hold them: it is the environment that has them lent at
     the time that answers. So those that are made one after the other share their programs, which
     no cache on the disk can hold.
@@ -119,16 +155,17 @@ class HostSlots:
       image_size, action_size: of the environments.
     """
 
-    has_host = True
     _free: dict[tuple[int, int], list[HostSlots]] = {}
     _lock = threading.Lock()
 
     def __init__(self, image_size: int, action_size: int):
-        self.image_size, self.action_size = image_size, action_size
         self._env: Callable[[], HostEnv | None] = lambda: None
-        results = _results(image_size)
-        self._call_reset = on_host(lambda rows: self._holder().answer_reset(rows), results)
-        self._call_step = on_host(lambda rows: self._holder().answer_step(rows), results)
+        super().__init__(
+            image_size,
+            action_size,
+            lambda rows: self._holder().answer_reset(rows),
+            lambda rows: self._holder().answer_step(rows),
+        )
 
     @classmethod
     def lent_to(cls, env: HostEnv) -> HostSlots:
@@ -151,24 +188,8 @@ class HostSlots:
             raise SimulatorError("the environment of this program is closed")
         return env
 
-    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
-        """See `HostEnv.reset`."""
-        row = key_words(slot, key)
-        return _time_step(row[0], *self._call_reset(row))
 
-    def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
-        """See `HostEnv.step`."""
-        row = action_words(state, action, self.action_size)
-        return _time_step(state.slot, *self._call_step(row))
-
-
-def _results(image_size: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
-    """What the host answers for one slot: the image, and the words of `_host_results`."""
-    image = jax.ShapeDtypeStruct((image_size, image_size, 3), jnp.uint8)
-    return image, jax.ShapeDtypeStruct((4,), jnp.int32)
-
-
-class HostEnv:
+class HostEnv(HostProgram):
     """An `Env` over simulators that live in worker processes.
 
     Args:
@@ -183,8 +204,6 @@ class HostEnv:
         first so many, the next, and so on. Slots beyond P * K rest always.
     """
 
-    has_host = True
-
     def __init__(
         self,
         tasks: Sequence[TaskSpec],
@@ -198,9 +217,7 @@ class HostEnv:
     ):
         self.tasks = tuple(tasks)
         self.members, self.shards = members, shards
-        self.image_size = image_size
         self.action_repeat = action_repeat
-        self.action_size = action_size
         self.discrete = self.tasks[0].discrete
         self._calls = HostCalls()
         share = members_of_shard(members, shards) * len(self.tasks)
@@ -212,8 +229,7 @@ class HostEnv:
         results = _results(image_size)
         self.answer_reset = self._calls.guarded(self._host_reset, results)
         self.answer_step = self._calls.guarded(self._host_step, results)
-        self._call_reset = on_host(self.answer_reset, results)
-        self._call_step = on_host(self.answer_step, results)
+        super().__init__(image_size, action_size, self.answer_reset, self.answer_step)
         self._lent: HostSlots | None = None
         self._closed = False
 
@@ -225,20 +241,6 @@ class HostEnv:
                 return self
             self._lent = HostSlots.lent_to(self)
         return self._lent
-
-    def reset(self, slot: jax.Array, key: jax.Array) -> tuple[Token, TimeStep]:
-        """Put a new simulator, seeded by `key` (typed or raw), into `slot` (int32 []).
-
-        Map over `slot`, whatever else is mapped: with nothing mapped all members would share
-        one simulator.
-        """
-        row = key_words(slot, key)
-        return _time_step(row[0], *self._call_reset(row))
-
-    def step(self, state: Token, action: jax.Array) -> tuple[Token, TimeStep]:
-        """One tick with `action` (float32 [A], clipped to [-1, 1], or one-hot)."""
-        row = action_words(state, action, self.action_size)
-        return _time_step(state.slot, *self._call_step(row))
 
     def rest(self, slots: np.ndarray) -> None:
         """Let slots idle: their images are black and their rewards 0, and no simulator runs.
