@@ -174,10 +174,11 @@ def model_loss(model: Model, trainable: Params, params: Params, batch: Records, 
     """
     config = model.config.learning
     params = joined(params, trainable)
-    batch = batch._replace(image=arrange(batch.image))
+    batch = batch._replace(image=arrange(batch.image, method=model.convolutions))
     posterior, prior_mean, prior_std = model.observe(params, batch, key)
     features = posterior.features
-    image_loss = image_distance(model.decode(params, features), batch.image).mean()
+    prediction = model.decode(params, features)
+    image_loss = image_distance(prediction, batch.image, method=model.convolutions).mean()
     reward_loss = losses.unit_gaussian_loss(model.reward(params, features), batch.reward)
     kl = losses.gaussian_kl(posterior.mean, posterior.std, prior_mean, prior_std)
     loss = image_loss / config.image_std**2 + reward_loss / config.reward_std**2

@@ -22,14 +22,14 @@ import jax.numpy as jnp
 
 from dreamer_jax import networks, randomness, rssm
 from dreamer_jax.config import Config
-from dreamer_jax.convolutions import normalise_image
+from dreamer_jax.convolutions import Method, normalise_image
 from dreamer_jax.freezing import Params
 from dreamer_jax.records import Records
 
-Method = TypeVar("Method", bound=Callable)
+Wrapped = TypeVar("Wrapped", bound=Callable)
 
 
-def multiplies(method: Method) -> Method:
+def multiplies(method: Wrapped) -> Wrapped:
     """A method of a model, with products of matrices in the precision that its settings ask for."""
 
     @functools.wraps(method)
@@ -69,15 +69,23 @@ class Model:
             return contextlib.nullcontext()
         return jax.default_matmul_precision(precision)
 
+    @property
+    def convolutions(self) -> Method | None:
+        """How they are computed; None: as is best on the default device."""
+        method = self.config.network.convolutions
+        return None if method == "auto" else method
+
     @functools.cached_property
     def encoder(self) -> networks.Encoder:
         network = self.config.network
-        return networks.Encoder(network.encoder_depth, network.image_size, self.dtype)
+        sizes = network.encoder_depth, network.image_size
+        return networks.Encoder(*sizes, self.dtype, self.convolutions)
 
     @functools.cached_property
     def decoder(self) -> networks.Decoder:
         network = self.config.network
-        return networks.Decoder(network.encoder_depth, network.image_size, self.dtype)
+        sizes = network.encoder_depth, network.image_size
+        return networks.Decoder(*sizes, self.dtype, self.convolutions)
 
     @functools.cached_property
     def dynamics(self) -> rssm.Dynamics:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from dreamer_jax.convolutions import convolution, transposed_convolution
+from dreamer_jax.convolutions import Method, convolution, transposed_convolution
 
 Dtype = jnp.dtype | type
 
@@ -73,7 +73,7 @@ class Dense(nn.Module):
 class Convolution(nn.Module):
     """A convolution, or a transposed one, of stride 2 without padding, and a relu.
 
-    The same two parameters serve every way of computing it (see dreamer_jax.convolutions).
+    The same two parameters serve every method of computing it (see dreamer_jax.convolutions).
     """
 
     features: int
@@ -81,6 +81,7 @@ class Convolution(nn.Module):
     transposed: bool = False
     relu: bool = True
     dtype: Dtype = jnp.float32
+    method: Method | None = None
 
     @nn.compact
     def __call__(self, inputs: jax.Array) -> jax.Array:
@@ -89,7 +90,7 @@ class Convolution(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         apply = transposed_convolution if self.transposed else convolution
         arrays = (x.astype(self.dtype) for x in (inputs, kernel, bias))
-        return apply(*arrays, relu=self.relu)
+        return apply(*arrays, relu=self.relu, method=self.method)
 
 
 def encoder_layers(image_size: int) -> int:
@@ -106,12 +107,15 @@ class Encoder(nn.Module):
     depth: int
     image_size: int
     dtype: Dtype = jnp.float32
+    method: Method | None = None
 
     @nn.compact
     def __call__(self, images: jax.Array) -> jax.Array:
         x = images
         for i in range(encoder_layers(self.image_size)):
-            x = Convolution(self.depth * 2**i, 4, dtype=self.dtype, name=f"conv_{i}")(x)
+            channels = self.depth * 2**i
+            layer = Convolution(channels, 4, False, True, self.dtype, self.method, name=f"conv_{i}")
+            x = layer(x)
         return x.reshape(*x.shape[:-3], -1)
 
 
@@ -125,6 +129,7 @@ class Decoder(nn.Module):
     depth: int
     image_size: int
     dtype: Dtype = jnp.float32
+    method: Method | None = None
 
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
@@ -141,6 +146,7 @@ class Decoder(nn.Module):
                 transposed=True,
                 relu=not last,
                 dtype=self.dtype,
+                method=self.method,
                 name=f"deconv_{i}",
             )(x)
         return x.astype(jnp.float32)

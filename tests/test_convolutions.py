@@ -1,5 +1,6 @@
 """The two ways of computing the strided layers, against each other, flax and numbers by hand."""
 
+import dataclasses
 import functools
 
 import flax.linen as nn
@@ -11,6 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from dreamer_jax.agent import Agent
+from dreamer_jax.config import preset
 from dreamer_jax.convolutions import (
     arrange,
     convolution,
@@ -238,6 +241,22 @@ def test_the_default_is_matmul_on_cpus_and_nvidia_cards_and_the_library_elsewher
     assert uses_library()
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert not uses_library()
+
+
+@pytest.mark.parametrize(("method", "layers"), [("matmul", 0), ("library", 6), ("auto", 0)])
+def test_the_setting_of_a_network_chooses_the_method(method, layers):
+    config = preset("debug")
+    network = dataclasses.replace(config.network, convolutions=method)
+    agent = Agent(dataclasses.replace(config, network=network), 2)
+
+    def seen_and_drawn(params, images):
+        return agent.decode(params, jnp.zeros((1, network.feature_size))), agent.encode(
+            params, images
+        )
+
+    images = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.uint8)
+    text = str(jax.make_jaxpr(seen_and_drawn)(agent.parameter_shapes(), images))
+    assert text.count("conv_general_dilated") == layers
 
 
 @pytest.mark.parametrize("layer", LAYERS)

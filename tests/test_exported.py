@@ -12,7 +12,7 @@ from dreamer_jax.checkpoint import Checkpointer
 from experiments.cli.main import main
 from experiments.runs import export as export_module
 from experiments.runs import exported
-from experiments.runs.agents import load_params, load_source
+from experiments.runs.agents import check_source, load_params, load_source
 from experiments.runs.export import export
 from experiments.runs.exported import Card, is_exported, read_card, read_params, weights_path
 from experiments.runs.start import load_sources
@@ -190,6 +190,22 @@ def test_an_agent_is_exported_and_trained_from_on_the_command_line(run, tmp_path
     assert main([*words, "--source", str(file), "--omega", "0"]) == 2
     error = capsys.readouterr().err
     assert "agent.safetensors has other networks (" in error
+
+
+def test_how_networks_are_computed_may_differ_from_the_source_and_their_sizes_may_not(run):
+    source, spec = load_source(run, 0), spec_of("inverted_pendulum")
+    network = spec.config.network
+
+    def with_network(**settings):
+        changed = dataclasses.replace(network, **settings)
+        return dataclasses.replace(spec, config=dataclasses.replace(spec.config, network=changed))
+
+    others = {"precision": "bfloat16", "matmul_precision": "float32", "convolutions": "matmul"}
+    assert all(getattr(network, name) != value for name, value in others.items())
+    check_source(source, with_network(**others))
+    message = r"other networks \(head_units: 8 in the source, 9 here\)"
+    with pytest.raises(ValueError, match=message):
+        check_source(source, with_network(**others, head_units=9))
 
 
 def test_the_zoo_is_listed_and_told(run, tmp_path, played, capsys, monkeypatch):

@@ -16,7 +16,11 @@ from dreamer_jax.records import Records
 from runs import random_params
 
 A, STORED, UPDATES, SEEDS = 2, 10, 100, 3
-CONFIG = preset("debug")
+DEBUG = preset("debug")
+# Most updates here are computed, not only compiled.
+CONFIG = dataclasses.replace(
+    DEBUG, network=dataclasses.replace(DEBUG.network, convolutions="matmul")
+)
 B, L = CONFIG.learning.batch_size, CONFIG.learning.sequence_length
 LOSSES = ("image_loss", "reward_loss", "kl", "termination_loss", "actor_loss", "value_loss")
 

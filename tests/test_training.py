@@ -342,6 +342,7 @@ def learning_config(environment_steps, prefill_phases, **exploration):
         CONFIG,
         network=dataclasses.replace(
             CONFIG.network,
+            convolutions="auto",
             head_units=32,
             hidden_size=64,
             deterministic_size=16,

@@ -15,6 +15,7 @@ import envs
 import transfer
 from dreamer_jax.agent import Agent
 from dreamer_jax.checkpoint import load_tree
+from dreamer_jax.config import HOW_COMPUTED
 from experiments.runs import exported
 from experiments.runs.folder import failed_members
 from experiments.runs.spec import RunSpec, action_size, read_spec
@@ -140,7 +141,7 @@ def check_source(source: Source, spec: RunSpec) -> None:
       ValueError: naming every setting that differs, on both sides.
     """
     one, two = source.spec.config, spec.config
-    keys = [f.name for f in dataclasses.fields(one.network) if f.name != "precision"]
+    keys = [f.name for f in dataclasses.fields(one.network) if f.name not in HOW_COMPUTED]
     different = [
         f"{key}: {getattr(one.network, key)} in the source, {getattr(two.network, key)} here"
         for key in keys
