@@ -9,6 +9,7 @@ module's dtype. What a head or a distribution is read from is float32 from its l
 bfloat16 has 8 bits, and tells numbers about 150 apart by whole ones alone.
 """
 
+import functools
 import math
 from typing import Any
 
@@ -20,7 +21,15 @@ from dreamer_jax.convolutions import Method, convolution, transposed_convolution
 
 Dtype = jnp.dtype | type
 
-glorot_uniform = nn.initializers.glorot_uniform()
+# Flax asks an initialiser for its shape whenever a parameter is read: it is traced once.
+glorot_uniform = jax.jit(nn.initializers.glorot_uniform(), static_argnums=1)
+zeros = jax.jit(nn.initializers.zeros, static_argnums=1)
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def uniform(key: jax.Array, shape: tuple[int, ...], limit: float) -> jax.Array:
+    """float32 numbers between -limit and limit."""
+    return jax.random.uniform(key, shape, jnp.float32, -limit, limit)
 
 
 def add_bias(outputs: jax.Array, bias: jax.Array) -> jax.Array:
@@ -54,18 +63,14 @@ class Dense(nn.Module):
     def __call__(self, inputs: jax.Array) -> jax.Array:
         fan_in = self.fan_in or inputs.shape[-1]
         limit = math.sqrt(6 / (fan_in + self.features))
-
-        def uniform(key, shape):
-            return jax.random.uniform(key, shape, jnp.float32, -limit, limit)
-
-        kernel = self.param("kernel", uniform, (inputs.shape[-1], self.features))
+        kernel = self.param("kernel", uniform, (inputs.shape[-1], self.features), limit)
         outputs = jnp.matmul(
             inputs.astype(self.dtype),
             kernel.astype(self.dtype),
             preferred_element_type=self.output_dtype,
         )
         if self.use_bias:
-            bias = self.param("bias", nn.initializers.zeros, (self.features,))
+            bias = self.param("bias", zeros, (self.features,))
             outputs = add_bias(outputs, bias)
         return outputs
 
@@ -87,7 +92,7 @@ class Convolution(nn.Module):
     def __call__(self, inputs: jax.Array) -> jax.Array:
         shape = (self.kernel_size, self.kernel_size, inputs.shape[-1], self.features)
         kernel = self.param("kernel", glorot_uniform, shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        bias = self.param("bias", zeros, (self.features,))
         apply = transposed_convolution if self.transposed else convolution
         arrays = (x.astype(self.dtype) for x in (inputs, kernel, bias))
         return apply(*arrays, relu=self.relu, method=self.method)

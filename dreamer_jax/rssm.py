@@ -5,13 +5,14 @@ L sequence length, H imagination horizon, A action, E embedding size, M latent f
 Steps work on any leading axes, written "...".
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from dreamer_jax.networks import Dense, Dtype, add_bias, applied, elu, glorot_uniform
+from dreamer_jax.networks import Dense, Dtype, add_bias, applied, elu, glorot_uniform, zeros
 
 
 class LatentState(NamedTuple):
@@ -35,6 +36,7 @@ class LatentState(NamedTuple):
         return jnp.concatenate([self.stochastic, self.deterministic], axis=-1)
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def orthogonal(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """A matrix with orthonormal rows (or columns, if it is tall), uniform among all such.
 
@@ -75,7 +77,7 @@ class GRU(nn.Module):
         columns = 3 * self.features
         kernel = self.param("kernel", glorot_uniform, (inputs.shape[-1], columns))
         recurrent = self.param("recurrent_kernel", orthogonal, (self.features, columns))
-        bias = self.param("bias", nn.initializers.zeros, (2, columns))
+        bias = self.param("bias", zeros, (2, columns))
         from_inputs = inputs.astype(self.dtype) @ kernel.astype(self.dtype) + bias[0]
         from_hidden = hidden.astype(self.dtype) @ recurrent.astype(self.dtype) + bias[1]
         gates, recurrent_gates = (jnp.split(x, 3, axis=-1) for x in (from_inputs, from_hidden))
@@ -97,7 +99,7 @@ class JoinedDense(nn.Module):
 
     def setup(self):
         self.kernel = self.param("kernel", glorot_uniform, (sum(self.sizes), self.features))
-        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        self.bias = self.param("bias", zeros, (self.features,))
 
     def project(self, second: jax.Array) -> jax.Array:
         """The second input's share and the bias: [..., sizes[1]] -> [..., features]."""
