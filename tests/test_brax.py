@@ -21,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from jax.extend.core import jaxprs_in_params
 
 import envs
+from compilation import QUICK_CODE
 from dreamer_jax import device_replay
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
@@ -34,8 +36,10 @@ from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
 from envs.mixed import MixedEnv
 from envs.scene import Geometry, Scene
+from phases import phase_of
 from probes import Probe
 from runs import random_members
+from small_agent import Small
 
 NAMES = [name for name in envs.task_names() if name.startswith("brax/")]
 TITLES = [envs.spec(name).title for name in NAMES]
@@ -80,28 +84,6 @@ def hosted(drawing):
     made.close()
 
 
-@functools.cache
-def phase_of(env, tasks, ticks):
-    """A jitted phase of random actions by all P * K slots: first time steps, then T of them."""
-
-    @jax.jit
-    def phase(key):
-        slots = jnp.arange(env.members * tasks).reshape(env.members, tasks)
-        keys = jax.random.split(key, slots.shape)
-        state, start = jax.vmap(jax.vmap(env.reset))(slots, keys)
-        shape = (ticks, env.members, tasks, env.action_size)
-        actions = jax.random.uniform(key, shape, minval=-1, maxval=1)
-        return start, jax.lax.scan(jax.vmap(jax.vmap(env.step)), state, actions)[1]
-
-    def run(seed):
-        result = jax.tree.map(np.asarray, phase(jax.random.key(seed)))
-        env.check()
-        return result
-
-    run.phase = phase
-    return run
-
-
 FRESH_PROCESS = f"""
 import sys
 import envs.brax_pixels
@@ -110,7 +92,7 @@ for stream in (sys.stdout, sys.stderr):
     print("imported", file=stream, flush=True)
 
 import hashlib, jax
-from test_brax import phase_of
+from phases import phase_of
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 env = envs.make([{SWINGUP!r}], members=2, image_size=16)
@@ -151,7 +133,7 @@ def fresh(env, tmp_path_factory) -> Fresh:
 
 def psnr(one, other) -> np.ndarray:
     """Peak signal-to-noise ratio of pictures [..., height, width, 3] in decibel."""
-    error = np.square(one.astype(np.float64) - other).mean((-3, -2, -1))
+    error = np.square(np.asarray(one, np.float64) - np.asarray(other)).mean((-3, -2, -1))
     return 10 * np.log10(255**2 / np.maximum(error, 1e-9))
 
 
@@ -258,30 +240,54 @@ def test_an_agent_step_is_about_as_long_as_pybullets(brax_physics, title, name):
     assert 0.9 <= task.step_seconds / bullet.step_seconds <= 1.25
 
 
-def test_the_hopper_is_brax_own(brax_physics, monkeypatch):
+def test_the_hopper_is_brax_own(brax_physics):
     """The same states, rewards and falls as Brax's environment with actions held as long, in the
-    engine that compiles soonest."""
+    engine that compiles soonest. It is asked once, by Brax's; what ours asks of it is the same."""
     from brax.envs import get_environment
 
     own = get_environment("hopper", backend="spring", n_frames=8)
     physics = brax_physics.physics_of("Hopper", "spring")
+    assert type(physics.env) is type(own)
     assert (physics.env._n_frames, physics.seconds) == (own._n_frames, own.dt)
-    # The engine is the same one, and compiled once.
-    for part in ("pipeline_init", "pipeline_step"):
-        engine = jax.jit(getattr(own, part))
-        monkeypatch.setattr(own, part, engine)
-        monkeypatch.setattr(physics.env, part, engine)
-    actions = np.random.default_rng(0).uniform(-1, 1, (30, 3)).astype(np.float32)
+    assert same(*map(jax.tree.leaves, (physics.env.sys, own.sys)))
 
-    mine, brax = physics.start(jax.random.key(0)), own.reset(jax.random.key(0))
-    falls = []
-    for action in actions:
-        mine, reward, terminal = physics.step(mine, action)
-        brax = own.step(brax, action)
-        assert (reward, terminal) == (brax.reward, brax.done)
-        np.testing.assert_array_equal(mine.q, brax.pipeline_state.q)
-        falls.append(bool(terminal))
-    assert any(falls) and not all(falls)
+    def both(part, brax, ours):
+        """What Brax's and our functions return, and what they ask of a part of the engine."""
+        engine, asked = getattr(own, part), []
+
+        def ask(*arguments):
+            asked.append(arguments)
+            return engine(*arguments) if len(asked) == 1 else answer
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(own, part, ask)
+            patch.setattr(physics.env, part, ask)
+            theirs = brax()
+            answer = theirs.pipeline_state
+            mine = ours()
+        return theirs, mine, asked
+
+    @jax.jit
+    def played(key, actions):
+        started = both("pipeline_init", lambda: own.reset(key), lambda: physics.start(key))
+
+        def step(carry, action):
+            theirs, mine = carry
+            theirs, (mine, reward, terminal), asked = both(
+                "pipeline_step",
+                lambda: own.step(theirs, action),
+                lambda: physics.step(mine, action),
+            )
+            told = (theirs.pipeline_state.q, theirs.reward, theirs.done), (mine.q, reward, terminal)
+            return (theirs, mine), (told, asked)
+
+        return started[2], jax.lax.scan(step, started[:2], actions)[1]
+
+    actions = np.random.default_rng(0).uniform(-1, 1, (30, 3)).astype(np.float32)
+    (first, second), ((theirs, mine), (asked, ours)) = played(jax.random.key(0), actions)
+    assert same(first, second) and same(asked, ours) and same(theirs, mine)
+    falls = np.asarray(mine[2])
+    assert falls.any() and not falls.all()
 
 
 class Moving(NamedTuple):
@@ -292,44 +298,43 @@ class Moving(NamedTuple):
 
 
 @pytest.mark.parametrize("title", ["InvertedPendulum", "InvertedDoublePendulum"])
-def test_pendula_start_hanging_and_are_paid_the_cosines(brax_physics, monkeypatch, title):
+def test_pendula_start_hanging_and_are_paid_the_cosines(brax_physics, title):
+    from envs.brax_episodes import episodes_of
+
     physics = brax_physics.physics_of(title, "generalized")
-    with monkeypatch.context() as patch:
-        # What the engine adds to positions and velocities is not looked at.
-        patch.setattr(physics.env, "pipeline_init", lambda q, qd: Moving(q, qd))
-        keys = jax.random.split(jax.random.key(0), 200)
-        starts, velocities = jax.jit(jax.vmap(physics.start))(keys)
-    assert not velocities.any()
-    offsets = np.asarray(starts) - np.array([0, np.pi, 0])[: physics.positions]
+    episodes = episodes_of(physics, 1)
+    starts = jax.jit(episodes.begin)(jax.random.split(jax.random.key(0), 200))
+    assert not np.any(starts.qd)
+    offsets = np.asarray(starts.q) - np.array([0, np.pi, 0])[: physics.positions]
     assert not offsets[:, 0].any() and np.abs(offsets).max() <= 0.1
     # The mean and deviation of U(-0.1, 0.1), within four standard errors.
     np.testing.assert_allclose(offsets[:, 1:].mean(0), 0.0, atol=4 * 0.1 / np.sqrt(3 * 200))
     np.testing.assert_allclose(offsets[:, 1:].std(0), 0.1 / np.sqrt(3), rtol=0.15)
 
-    hinges = np.array([[0.0, 0.0], [np.pi, 0.0], [np.pi, np.pi], [np.pi / 2, 0.0]], np.float32)
-    # Pushed with all there is to one side, then to and fro between the ends of the rail, with
-    # periods of 0.3, 0.6, 0.8 and 1 s: as hard as any policy can.
-    to_and_fro = (-1.0) ** (np.arange(1000) // np.array([[9], [18], [24], [30]]))
+    hinges = np.array([[0.0, 0.0], [np.pi, 0.0], [np.pi, np.pi], [np.pi / 2, 0.0]])
+    # From each of these, pushed with all there is to one side, then to and fro between the ends of
+    # the rail, with periods of 0.3, 0.6, 0.8 and 1 s: as hard as any policy can.
+    to_and_fro = (-1.0) ** (np.arange(240) // np.array([[9], [18], [24], [30]]))
     actions = np.concatenate([np.zeros((4, 1)), np.ones((4, 60)), to_and_fro], axis=1)
-    actions = actions.astype(np.float32)
+    actions = np.tile(actions, (4, 1)).T[:, :, None].astype(np.float32)
+    positions = np.pad(hinges.repeat(4, axis=0), ((0, 0), (1, 0)))[:, : physics.positions]
+    keys, none = jax.random.split(jax.random.key(0), 16), np.zeros(16, bool)
 
-    @jax.jit
-    @jax.vmap
-    def pushed(hinges, actions):
-        positions = jnp.array([0.0, *hinges])[: physics.positions]
-        state = physics.env.pipeline_init(positions, jnp.zeros_like(positions))
+    @functools.partial(jax.jit, compiler_options=QUICK_CODE)
+    def pushed(states, actions):
+        def step(states, actions):
+            states, rewards, terminal = episodes.tick(states, actions, none, keys)
+            return states, (states.q, rewards, terminal)
 
-        def step(state, action):
-            state, reward, terminal = physics.step(state, action)
-            return state, (state.q, reward, terminal)
+        return jax.lax.scan(step, states, actions)[1]
 
-        return positions[1:], *jax.lax.scan(step, state, actions[:, None])[1]
-
-    start, positions, rewards, terminal = map(np.asarray, pushed(hinges, actions))
+    at_rest = jax.tree.map(lambda x: np.zeros_like(x[:16]), starts)
+    at_rest = at_rest._replace(q=positions.astype(np.float32))
+    positions, rewards, terminal = map(np.asarray, pushed(at_rest, actions))
     carts, angles = positions[..., 0], positions[..., 1:]
     np.testing.assert_allclose(rewards, np.cos(angles).sum(-1), atol=1e-3)
-    np.testing.assert_allclose(rewards[:, 0], np.cos(start).sum(-1), atol=0.05)
-    assert np.abs(angles[1, :61] - np.pi).max() > 1.6, "the hinge has no stops"
+    np.testing.assert_allclose(rewards[0], np.cos(at_rest.q[:, 1:]).sum(-1), atol=0.05)
+    assert np.abs(angles[:61, 4] - np.pi).max() > 1.6, "the hinge has no stops"
     assert not terminal.any(), "the engine follows, however hard the cart meets the rail's ends"
     assert 1.0 < np.abs(carts).max() < 1.2
 
@@ -478,9 +483,11 @@ def test_a_step_written_out_once_is_brax_own(brax_physics, title):
     physics = brax_physics.physics_of(title, "generalized")
     shared, plain = episodes_of(physics, 2), Episodes(physics, 2)
     assert type(shared) is not Episodes
-    ended = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]) != 0
+    plain.begin = jax.jit(plain.begin)  # traced once
+    # The first tick starts all of them.
+    ended = np.array([[1, 1, 1], [0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]) != 0
     keys = jax.random.split(jax.random.key(0), (6, 3))
-    actions = np.random.default_rng(0).uniform(-1, 1, (5, 3, physics.action_size))
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, 3, physics.action_size))
     actions = actions.astype(np.float32)
 
     def phase(episodes):
@@ -489,18 +496,15 @@ def test_a_step_written_out_once_is_brax_own(brax_physics, title):
             state = episodes.physics_state(states)
             return states, (state.q, state.qd, *jax.vmap(physics.poses)(state), rewards, terminal)
 
-        start = episodes.begin(keys[0])
-        seen = episodes.physics_state(start)
-        return (seen.q, *jax.vmap(physics.poses)(seen)), jax.lax.scan(
-            tick, start, (actions, ended, keys[1:])
-        )[1]
+        nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(episodes.begin, keys[0]))
+        return jax.lax.scan(tick, nothing, (actions, ended, keys))[1]
 
     results = [
         jax.tree.map(np.asarray, jax.jit(phase, static_argnums=0)(x)) for x in (shared, plain)
     ]
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=2e-4), *results)
-    (_, (_, _, _, _, rewards, terminal)), _ = results
-    assert not terminal.any() and not rewards[ended].any()
+    *_, rewards, terminal = results[0]
+    assert not terminal.any() and not rewards[ended].any() and rewards[~ended].all()
 
 
 # The environment
@@ -520,19 +524,12 @@ def test_a_phase_hangs_at_first_and_repeats_to_the_bit_after_others(env):
 
 def test_a_step_from_before_a_phase_is_its_reset(env):
     """Whatever the action; the tick after it too."""
-    slots, keys = jnp.arange(2), jax.random.split(jax.random.key(0), 2)
-
-    @jax.jit
-    def both(actions):
-        state, start = jax.vmap(env.reset)(slots, keys)
-        other, begun = jax.vmap(env.step)(jax.vmap(env.before)(slots, keys), actions)
-        return (
-            (state, start),
-            (other, begun),
-            *(jax.vmap(env.step)(x, actions)[1] for x in (state, other)),
-        )
-
-    (state, start), (other, begun), after, later = both(jnp.array([[0.5], [-1.0]]))
+    slots, keys = np.arange(2), jax.random.split(jax.random.key(0), 2)
+    actions = np.array([[0.5], [-1.0]], np.float32)
+    reset, before, step = (jax.jit(jax.vmap(x)) for x in (env.reset, env.before, env.step))
+    state, start = reset(slots, keys)
+    other, begun = step(before(slots, keys), actions)
+    after, later = (step(x, actions)[1] for x in (state, other))
     for name in ("slot", "key", "episode", "ended"):
         np.testing.assert_array_equal(getattr(state, name), getattr(other, name))
     assert start.first.all() and not after.first.any()
@@ -559,20 +556,23 @@ def test_environments_say_whether_they_have_a_host(env, hosted):
 
 @pytest.fixture(scope="module")
 def programs(brax_pixels):
-    """What a run of P = 1 compiles, by name, as text: of both pendula the round that is one program
-    with their phase, the update and the diagnosis, and the phase of the four other tasks."""
-    agent = Agent(preset("debug"), 1)
+    """What a run of P = 1 compiles, by name: of both pendula the round that is one program, by an
+    agent of one number; of agents with networks the phase of the four other tasks, the update and
+    the diagnosis."""
     pendula = [SWINGUP, "brax/inverted_double_pendulum"]
     made = envs.make(pendula, members=1, image_size=32)
-    state = jax.eval_shape(jax.vmap(agent.init), jnp.arange(1))
-    sums = jax.eval_shape(lambda: zero_sums(agent, state, 2, 5))
     held = jax.eval_shape(lambda: device_replay.empty(1, 2, 42, 32, 1))
+    drawn, number = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((4, 1, 2), ()))
+    seeds, mapped = np.arange(1), {"mapping": "auto", "chunk": 1}
+
+    def started(kind):
+        agent = kind(preset("debug"), 1)
+        state = jax.eval_shape(jax.vmap(agent.init), seeds)
+        return agent, state, jax.eval_shape(lambda: zero_sums(agent, state, 2, 5))
 
     def records(*lead):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*lead, *x.shape[3:]), x.dtype), held)
 
-    drawn, number = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((4, 1, 2), ()))
-    seeds, mapped = jnp.arange(1), {"mapping": "auto", "chunk": 1}
     others = [name for name in NAMES if name not in pendula]
     walkers = envs.make(others, members=1, image_size=32)
     padded = Agent(preset("debug"), walkers.action_size)
@@ -583,26 +583,36 @@ def programs(brax_pixels):
             padded, walkers, params, seeds, updates, number, tasks=4, ticks=20, mode=mode
         )
 
-    lowered = {
-        "round": whole_round.lower(
-            agent, made, state, sums, held, seeds, number, number, number, (drawn, drawn),
+    agent, *state = started(Agent)
+    small, *smalls_state = started(Small)
+    return {
+        "round": whole_round.trace(
+            small, made, *smalls_state, held, seeds, number, number, number, (drawn, drawn),
             ticks=20, length=5, **mapped,
         ),
-        "collect": jax.jit(phases).lower(params, state.updates, number, number),
-        "update": update_members.lower(agent, state, sums, records(1, 2, 5), **mapped),
-        "diagnose": diagnose.lower(agent, state.params, records(1, 2, 21), seeds, number),
+        "collect": jax.jit(phases).trace(params, state[0].updates, number, number),
+        "update": update_members.trace(agent, *state, records(1, 2, 5), **mapped),
+        "diagnose": diagnose.trace(agent, state[0].params, records(1, 2, 21), seeds, number),
     }  # fmt: skip
-    return {name: program.as_text() for name, program in lowered.items()}
+
+
+def primitives(jaxpr):
+    """The names of all that a traced program does, in the programs within it too."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for within in jaxprs_in_params(equation.params):
+            yield from primitives(within)
 
 
 @pytest.mark.parametrize("name", ["round", "collect", "update", "diagnose"])
 def test_no_program_of_a_run_calls_the_host(programs, name):
-    assert "callback" not in programs[name] and len(programs[name]) > 10_000
+    found = list(primitives(programs[name].jaxpr.jaxpr))
+    assert not [name for name in found if "callback" in name] and len(found) > 100
 
 
 def test_a_whole_round_of_several_tasks_is_one_program_that_reuses_its_memory(programs):
     """Collecting, storing, sampling and updating."""
-    program = programs["round"]
+    program = programs["round"].lower().as_text()
     assert program.count("func.func public") == 1
     assert "jax.buffer_donor" in program or "tf.aliasing_output" in program
 
@@ -703,24 +713,24 @@ def test_the_action_is_held_up_to_a_fall_and_the_next_tick_resets(counting, kind
     assert (state.episode, state.ended) == (1, 0)
 
 
-@pytest.mark.parametrize("slots", [[2, 1, 3, 0], [1, 2]], ids=str)
-def test_each_slot_plays_its_own_task_in_any_order_and_number(counting, kind, slots):
+def test_each_slot_plays_its_own_task_in_any_order_and_number(counting, kind):
     env = counting(kind, "brax/ant", "brax/hopper", members=2)
-    slots = jnp.array(slots)
 
     @jax.jit
-    def phase(keys):
+    def phase(slots, keys):
         state, _ = jax.vmap(env.reset)(slots, keys)
         actions = jnp.broadcast_to(slots[:, None] + 1.0, (6, len(slots), 2))
         return jax.lax.scan(jax.vmap(env.step), state, actions)[1]
 
-    record = phase(jax.random.split(jax.random.key(0), len(slots)))
-    env.check()
-    for column, slot in enumerate(slots.tolist()):
-        ends = 3 if slot % 2 == 0 else 5
-        assert np.argmax(record.terminal[:, column]) == ends - 1
-        assert np.argmax(record.first[:, column]) == ends
-        np.testing.assert_array_equal(record.reward[:ends, column], slot + 1.0)
+    for slots in ([2, 1, 3, 0], [1, 2]):
+        record = phase(np.array(slots), jax.random.split(jax.random.key(0), len(slots)))
+        record = jax.tree.map(np.asarray, record)
+        env.check()
+        for column, slot in enumerate(slots):
+            ends = 3 if slot % 2 == 0 else 5
+            assert np.argmax(record.terminal[:, column]) == ends - 1
+            assert np.argmax(record.first[:, column]) == ends
+            np.testing.assert_array_equal(record.reward[:ends, column], slot + 1.0)
 
 
 def test_pictures_show_the_state_after_a_tick_and_after_a_reset(counting):
