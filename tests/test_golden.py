@@ -9,7 +9,6 @@ import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -99,11 +98,11 @@ def updated(trace):
         assert sorted(draws.drawn) == sorted(expected_draws)
         return result
 
-    state = agent.start(jax.tree.map(jnp.asarray, nested(under(trace, "start"))), seed=0)
+    state = jax.device_get(agent.start(nested(under(trace, "start")), seed=0))
     results = []
     for i in range(UPDATES):
         batch = Records(**under(trace, f"batch_{i}"))
-        state, metrics = update(state, batch, under(trace, f"noise_{i}"))
+        state, metrics = jax.device_get(update(state, batch, under(trace, f"noise_{i}")))
         results.append((state, metrics))
     return results
 
