@@ -56,6 +56,7 @@ def made(tmp_path_factory):
         with contextlib.redirect_stdout(printed):
             assert main([*PART, "--results", str(results)]) == 0
     assert trained == [SOURCE, TARGETS]
+    assert f"run 2 of 2, {TARGETS}" in printed.getvalue()
     assert "Table 7: InvertedPendulum, overall return" in printed.getvalue()
     return results
 
@@ -82,7 +83,7 @@ def test_a_table_made_again_repeats_nothing(made, root, written, capsys):
     assert main([*PART, "--results", str(made)]) == 0
     assert metrics(root) == before
     assert [entry.name for entry in written] == ["table-7"]
-    assert "begins" not in capsys.readouterr().out
+    assert "run 1 of" not in capsys.readouterr().out
 
 
 def test_what_was_transferred_is_written_leaf_by_leaf(root):
