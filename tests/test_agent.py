@@ -417,8 +417,9 @@ def with_choices():
         learned, moments = carry
 
         def loss(learned):
-            total, (posterior, metrics) = model_loss(agent, learned, params, batch, key)
-            others, behaviour = behaviour_loss(agent, learned, params, posterior, key)
+            head, actor = ({name: learned[name]} for name in ("termination", "actor"))
+            total, (posterior, metrics) = model_loss(agent, head, params, batch, key)
+            others, behaviour = behaviour_loss(agent, actor, params | learned, posterior, key)
             return total + others, metrics | behaviour
 
         gradient, metrics = jax.grad(loss, has_aux=True)(learned)
