@@ -36,6 +36,7 @@ from envs import SimulatorError, TaskSpec
 from envs.bridge import HostEnv
 from envs.mixed import MixedEnv
 from envs.scene import Geometry, Scene
+from golden import brax_reference
 from phases import phase_of
 from probes import Probe
 from runs import random_members
@@ -355,35 +356,13 @@ def test_a_state_that_is_not_finite_ends_the_episode_before_it(brax_physics, mon
 
 @pytest.mark.parametrize("title", TITLES)
 def test_links_are_where_brax_has_them_and_a_step_moves_them_as_there(brax_physics, title):
-    """At random positions and velocities, some of which touch the floor or a joint's end. Brax
-    makes a state with the exact inverse of its mass matrix, as all steps here have it."""
-    from brax.generalized import pipeline
-
+    """At random positions and velocities."""
     from envs.brax_chain import Chain
     from envs.brax_forces import Forces
 
-    physics = brax_physics.physics_of(title, "generalized")
-    system, random = physics.env.sys, np.random.default_rng(0)
+    system = brax_physics.physics_of(title, "generalized").env.sys
     chain = Chain(system)
     forces = Forces(system, chain)
-    # A root's quaternion is not of length 1 then.
-    q = np.asarray(system.init_q) + 0.5 * random.normal(size=(16, system.q_size()))
-    qd = 3 * random.normal(size=(16, system.qd_size()))
-    controls = random.uniform(-1, 1, (16, system.act_size()))
-    q, qd, controls = (np.asarray(x, np.float32) for x in (q, qd, controls))
-
-    @jax.jit
-    @jax.vmap
-    def brax(q, qd, controls):
-        state = pipeline.init(system, q, qd)
-        # What a step makes ready for the next one is not looked at, and is most of it.
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pipeline.kinematics, "forward", lambda *_: (state.x, state.xd))
-            patch.setattr(pipeline.dynamics, "transform_com", lambda _, moved: moved)
-            patch.setattr(pipeline.mass, "matrix_inv", lambda _, moved, __: moved)
-            patch.setattr(pipeline.constraint, "jacobian", lambda _, moved: moved)
-            after = pipeline.step(system, state, controls)
-        return state, (after.q, after.qd)
 
     @jax.jit
     def ours(q, qd, controls):
@@ -391,30 +370,31 @@ def test_links_are_where_brax_has_them_and_a_step_moves_them_as_there(brax_physi
         motions = chain.motions(places, qd)
         return places, motions, forces.moved(q, qd, places, motions, controls)
 
-    state, after = brax(q, qd, controls)
-    places, motions, moved = ours(q, qd, controls)
-    held = np.asarray(state.con_diag > 0).sum(1)
-    assert len(set(held.tolist())) > 1, "some are held by what others are not"
-    pairs = (
-        (places.positions, state.x.pos),
-        (places.quaternions, state.x.rot),
-        (motions.centre[:, None], state.root_com[:, :1]),
-        (motions.moments, state.cinr.transform.pos),
-        (motions.inertia, state.cinr.i),
-        (motions.turns, state.cdof.ang),
-        (motions.moves, state.cdof.vel),
-        (motions.link_turns, state.cd.ang),
-        (motions.link_moves, state.cd.vel),
-        (motions.turns_rate, state.cdofd.ang),
-        (motions.moves_rate, state.cdofd.vel),
-    )
-    for one, other in pairs:
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=5e-5)
+    q, qd, controls = brax_reference.inputs_of(system)
+    brax = brax_reference.reference(title, system)
+    places, motions, moved = jax.device_get(ours(q, qd, controls))
+    assert len(set(brax["held"].tolist())) > 1, "some are held by what others are not"
+    found = {**places._asdict(), **motions._asdict(), "centre": motions.centre[:, None]}
+    compared = set(brax) & set(found)
+    assert set(brax) - compared == {"held", "q", "qd"}
+    for name in compared:
+        np.testing.assert_allclose(found[name], brax[name], rtol=1e-4, atol=5e-5, err_msg=name)
     # In units of what a step brings about.
-    scale = np.abs(after[1] - qd).max()
+    scale = np.abs(brax["qd"] - qd).max()
     assert scale > 0.1
-    np.testing.assert_allclose(moved[1], after[1], rtol=2e-4, atol=2e-4 * scale)
-    np.testing.assert_allclose(moved[0], after[0], atol=2e-4 * scale * system.opt.timestep + 1e-5)
+    np.testing.assert_allclose(moved[1], brax["qd"], rtol=2e-4, atol=2e-4 * scale)
+    step = 2e-4 * scale * system.opt.timestep
+    np.testing.assert_allclose(moved[0], brax["q"], atol=step + 1e-5)
+
+
+def test_the_numbers_of_brax_that_are_stored_are_its_own(brax_physics):
+    """Of one task: those of the others were written by the same lines."""
+    system = brax_physics.physics_of("InvertedPendulum", "generalized").env.sys
+    stored = brax_reference.reference("InvertedPendulum", system)
+    computed = brax_reference.computed(system)
+    assert set(stored) == set(computed)
+    for name, numbers in computed.items():
+        np.testing.assert_allclose(stored[name], numbers, rtol=1e-4, atol=5e-5, err_msg=name)
 
 
 @pytest.mark.parametrize("trials", [3, 15])
