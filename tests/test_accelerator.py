@@ -308,13 +308,13 @@ def test_where_memory_is_short_members_are_updated_in_chunks_and_the_row_says_so
     part = update_part(monkeypatch, limit=10_000)
     told = []
     found = part("P=9", told.append)
-    # By the compiler's count all fit; the device says otherwise twice.
-    assert FakeUpdates.compiled == [("vmap", 9), ("chunks", 8), ("chunks", 4)]
-    assert found["mapped"] == "chunks of 4" and found["without_memory"] == ["vmap", "chunks of 8"]
+    # By the compiler's count all fit; the device says otherwise of 9, and of 8 as 5 and 4.
+    assert FakeUpdates.compiled == [("vmap", 9), ("chunks", 5), ("chunks", 3)]
+    assert found["mapped"] == "chunks of 3" and found["without_memory"] == ["vmap", "chunks of 5"]
     assert found["member_updates_per_second"] == 9 / 0.5
-    assert told == [{"told": "vmap: no memory for it"}, {"told": "chunks of 8: no memory for it"}]
+    assert told == [{"told": "vmap: no memory for it"}, {"told": "chunks of 5: no memory for it"}]
     said = at_once(found["mapped"], found["without_memory"])
-    assert said == "chunks of 4 (no memory for vmap, chunks of 8)"
+    assert said == "chunks of 3 (no memory for vmap, chunks of 5)"
 
 
 def test_what_is_known_to_be_far_too_large_is_not_even_compiled(monkeypatch):
