@@ -17,7 +17,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.accelerator import command, measures
 from benchmarks.accelerator.peaks import known_peaks
-from benchmarks.accelerator.plan import LEARNING_TASK, SIZES, Part, parts
+from benchmarks.accelerator.plan import LEARNING_TASK, MINUTES, SIZES, Part, parts
 from benchmarks.accelerator.table import at_once
 from dreamer_jax.agent import Agent
 from dreamer_jax.config import preset
@@ -30,6 +30,27 @@ def executable(path, text):
     path.write_text(f"#!/bin/sh\n{text}\n")
     path.chmod(0o755)
     return str(path)
+
+
+# Seconds of each case on an NVIDIA H100, the start of its part's process in the first. Those of 57
+# members, of 256 and 1024 rollouts and of the second round are guesses: their time ended before.
+ON_A_CARD = {
+    "update float32": (22, 18, 18, 36, 60),
+    "update bfloat16": (23, 19, 20, 18, 60),
+    "peer": (50,),
+    "rollout": (30, 15, 15, 15, 20, 30),
+    "round": (83, 83),
+}
+
+
+def test_the_time_that_parts_have_by_default_is_enough_on_a_card():
+    *measured, learning = parts(SIZES["thesis"])
+    assert sum(part.share for part in (*measured, learning)) == pytest.approx(1)
+    now = until = 0.0
+    for part in measured:
+        until += part.share * 60 * MINUTES
+        now += sum(ON_A_CARD[part.name])
+        assert len(ON_A_CARD[part.name]) == len(part.cases) and now <= until, part.name
 
 
 def read(path):
