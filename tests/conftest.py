@@ -74,6 +74,16 @@ def pytest_collection_finish():
     gc.set_threshold(50_000, 20, 50)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def compiled_programs_are_kept():
+    """What tests have compiled serves later ones, and takes seconds to free."""
+    import jax
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "clear_caches", lambda: None)
+        yield
+
+
 @pytest.fixture(scope="module")
 def small_agents_are_diagnosed():
     """Runs diagnose agents of one number (small_agent.py), which have no networks to ask."""

@@ -1,5 +1,6 @@
 """Running the graph: in order, once each, going on where one fails; and what it will take."""
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -148,13 +149,23 @@ def test_two_sweeps_at_once_share_the_work_and_train_nothing_twice(tmp_path, mon
     assert first.shared == [WALKERS_SOURCE, WALKER]
 
 
-def test_what_a_run_compiled_is_freed_after_it(tmp_path, monkeypatch):
-    compiled = jax.jit(lambda x: x + 1)
+@pytest.mark.parametrize("error", [None, ValueError("byte 7")])
+def test_what_a_run_compiled_is_freed_after_it(tmp_path, monkeypatch, error):
+    happened = []
+
+    def carry_out(run, _):
+        happened.append("trained")
+        if error is not None:
+            raise error
+        return "finished"
+
     monkeypatch.setattr(jobs, "make_run", lambda *_, **__: 1)
-    monkeypatch.setattr(jobs, "carry_out", lambda run, _: compiled(run) and "finished")
+    monkeypatch.setattr(jobs, "carry_out", carry_out)
+    monkeypatch.setattr(jax, "clear_caches", lambda: happened.append("freed"))
     source, *_ = plan(tmp_path)
-    assert jobs.train(source, tmp_path) == "finished"
-    assert compiled._cache_size() == 0
+    with contextlib.nullcontext() if error is None else pytest.raises(ValueError, match="byte 7"):
+        assert jobs.train(source, tmp_path) == "finished"
+    assert happened == ["trained", "freed"]
 
 
 # --- what it will take ------------------------------------------------------------------------

@@ -52,7 +52,8 @@ def quick_compilation():
     given = dict(word.removeprefix("--").split("=") for word in os.environ["XLA_FLAGS"].split())
     names = ["xla_backend_optimization_level"]
     names += ["xla_cpu_use_fusion_emitters", "xla_cpu_parallel_codegen_split_count"]
-    return {name: json.loads(given[name]) for name in names if name in given}
+    found = {name: json.loads(given[name]) for name in names if name in given}
+    return found | {"xla_disable_hlo_passes": given["xla_disable_hlo_passes"]}
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux")
