@@ -230,6 +230,20 @@ def of_settings(agent):
     return schedule.mapping_chunk if schedule.mapping == "chunks" else 4
 
 
+@pytest.mark.parametrize(
+    ("members", "fits", "chunk"),
+    # 18 are 9 and 9 rather than 11 and 7; 57 are five of 10 and 7 rather than five of 11 and 2.
+    [(18, 11, 9), (57, 11, 10), (57, 19, 19), (9, 8, 5), (4, 3, 2), (3, 2, 2), (5, 1, 1)],
+)
+def test_chunks_are_as_even_as_as_many_turns_allow(monkeypatch, members, fits, chunk):
+    monkeypatch.setattr(memory, "at_once", lambda agent, each: each)
+    monkeypatch.setattr(memory, "room_for", lambda *_: fits)
+    schedule = memory.in_memory(
+        spec_of("hopper", seeds=tuple(range(members)), config=DEBUG), 1
+    ).config.schedule
+    assert (schedule.mapping, schedule.mapping_chunk) == ("chunks", chunk)
+
+
 def test_from_python_the_message_names_keywords(tmp_path, monkeypatch):
     seen = []
 

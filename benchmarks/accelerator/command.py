@@ -52,7 +52,7 @@ class Options:
     sizes: Literal["thesis", "debug"] = "thesis"
     """debug: everything as small as can be, to see that it works."""
     minutes: float = setting(MINUTES, 0, 10_000, above=True)
-    """All of it takes no longer; half of it is for the run that learns."""
+    """All of it takes no longer; more than a third of it is for the run that learns."""
     peer: str | None = None
     """A Python with PyTorch and NumPy, in which the peer runs; by default this one, if it has
     them."""

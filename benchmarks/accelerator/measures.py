@@ -40,7 +40,7 @@ from dreamer_jax.config import Config, preset
 from dreamer_jax.host_memory import keep_freed_memory
 from dreamer_jax.logs import read_metrics
 from envs.pool import available_cores
-from experiments.runs.memory import MEMORY_SHARE, bytes_of, in_memory, is_exhausted
+from experiments.runs.memory import MEMORY_SHARE, bytes_of, even_chunk, in_memory, is_exhausted
 from experiments.runs.run import carry_out, make_run, revision
 from experiments.runs.spec import RunSpec
 from experiments.thesis.measurement import operations
@@ -157,10 +157,10 @@ class UpdatePart:
         # Far too many are not even compiled.
         if members == 1 or self._fitting(members, 1.3) >= members:
             yield members
-        chunk = min(self._fitting(members, 1.0), members - 1)
-        while chunk:
-            yield chunk
-            chunk //= 2
+        fits = min(self._fitting(members, 1.0), members - 1)
+        while fits:
+            yield even_chunk(members, fits)  # as runs choose them
+            fits //= 2
 
     def _fitting(self, members: int, times: float) -> int:
         """How many members' updates fit into so many times the memory, by that of one's."""

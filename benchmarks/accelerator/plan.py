@@ -94,12 +94,12 @@ def parts(sizes: Sizes) -> tuple[Part, ...]:
         for several in (sizes.populations, sizes.rollouts)
     )
     return (
-        Part("update float32", populations, 0.12),
-        Part("update bfloat16", populations, 0.12),
+        Part("update float32", populations, 0.16),
+        Part("update bfloat16", populations, 0.14),
         Part("peer", ("P=1",), 0.06),
-        Part("rollout", rollouts, 0.08),
-        Part("round", (ONE_PROGRAM, DISPATCHES), 0.12),
-        Part("learning", (LEARNING_TASK,), 0.5),
+        Part("rollout", rollouts, 0.10),
+        Part("round", (ONE_PROGRAM, DISPATCHES), 0.16),
+        Part("learning", (LEARNING_TASK,), 0.38),
     )
 
 

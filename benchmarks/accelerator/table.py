@@ -121,7 +121,7 @@ _TABLES: tuple[tuple[str, Callable[[str], bool], tuple[Column, ...]], ...] = (
             ("members at once", lambda x: at_once(x["mapped"], x["without_memory"])),
             ("share of the peak", lambda x: percent(x["share_of_peak"])),
             ("compiled in, s", lambda x: number(x["compile_seconds"])),
-            ("most memory", lambda x: size(x["peak_bytes"])),
+            ("most memory so far", lambda x: size(x["peak_bytes"])),
         ),
     ),
     (
@@ -141,7 +141,7 @@ _TABLES: tuple[tuple[str, Callable[[str], bool], tuple[Column, ...]], ...] = (
             ("agent steps a second", lambda x: number(x["agent_steps_per_second"])),
             ("task", lambda x: x["task"]),
             ("compiled in, s", lambda x: number(x["compile_seconds"])),
-            ("most memory", lambda x: size(x["peak_bytes"])),
+            ("most memory so far", lambda x: size(x["peak_bytes"])),
         ),
     ),
     (
@@ -152,7 +152,7 @@ _TABLES: tuple[tuple[str, Callable[[str], bool], tuple[Column, ...]], ...] = (
             ("of agent steps", lambda x: number(x["agent_steps"])),
             ("and updates", lambda x: number(x["updates"])),
             ("the first, s", lambda x: number(x["first_round_seconds"])),
-            ("most memory", lambda x: size(x["peak_bytes"])),
+            ("most memory so far", lambda x: size(x["peak_bytes"])),
         ),
     ),
 )

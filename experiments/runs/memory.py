@@ -5,6 +5,7 @@ Axis letters: P population member, K task.
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +89,19 @@ def at_once(agent: Agent, members: int) -> int:
     return members
 
 
+def even_chunk(members: int, fits: int) -> int:
+    """Members in a chunk: as many turns as with so many that fit, and chunks as even as can be.
+
+    Chunks of one size are one program; a smaller last one is a second, which is compiled too.
+
+    Args:
+      members: how many lie on the device.
+      fits: how many of them it has memory for at once, at least 1.
+    """
+    turns = math.ceil(members / fits)
+    return math.ceil(members / turns)
+
+
 def room_for(agent: Agent, tasks: int, members: int, has_host: bool) -> int | None:
     """How many members' updates a device has memory for at once, by what the compiler says of one.
 
@@ -119,13 +133,13 @@ def in_memory(spec: RunSpec, devices: Choice = "all") -> RunSpec:
     if spec.config.schedule.mapping != "auto":
         return spec
     agent, each = make_agent(spec), place(len(spec.members), devices).each
-    if at_once(agent, each) == 1:
+    if (members := at_once(agent, each)) == 1:
         return spec
     has_host = any(task.has_host for task in envs.specs(spec.tasks))
     fits = room_for(agent, len(spec.tasks), each, has_host)
-    if fits is None or fits >= at_once(agent, each):
+    if fits is None or fits >= members:
         return spec
-    return mapped(spec, "chunks", fits)
+    return mapped(spec, "chunks", even_chunk(members, fits))
 
 
 def mapped(spec: RunSpec, mapping: Mapped, chunk: int) -> RunSpec:
@@ -159,7 +173,7 @@ def out_of_memory(run: Run, ways: WaysOut) -> OutOfMemoryError:
         return OutOfMemoryError(f"{told}: what is left is {ways.otherwise}")
     room, half = room_for(agent, tasks, each, run.env.has_host), before // 2
     if room is not None and room < before:
-        chunk, why = room, "by the compiler's count that fits"
+        chunk, why = even_chunk(each, room), "by the compiler's count that fits"
     else:
         chunk, why = half, "half as many; fewer if that does not fit either"
     goes_on = ways.with_chunks.format(chunk=chunk)

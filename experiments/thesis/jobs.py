@@ -142,7 +142,8 @@ def train(run: PlannedRun, root: Path, means: Means = PLAIN) -> Literal["finishe
         )
         return carry_out(begins, means.ways)
     finally:
-        # The programs of its simulators serve no other run, and take up to 100 MiB a task.
+        # The programs of its simulators take up to 100 MiB a task, and serve other runs only where
+        # sizes are the same.
         jax.clear_caches()
 
 
