@@ -263,7 +263,10 @@ def from_files(run):
     return dataclasses.replace(run, spec=spec)
 
 
-@pytest.mark.parametrize(("fitting", "chunk"), [(0.5, 1), (3.5, 3), (5.9, 5), (6.1, None)])
+# Of 6 agents: where 3, 4 or 5 fit, they go in two turns of 3.
+@pytest.mark.parametrize(
+    ("fitting", "chunk"), [(0.5, 1), (2.5, 2), (3.5, 3), (5.9, 3), (6.1, None)]
+)
 def test_updates_go_in_chunks_of_as_many_agents_as_an_accelerator_has_memory_for(
     tmp_path, monkeypatch, fitting, chunk
 ):
