@@ -15,7 +15,7 @@ from dreamer_jax.population import batch_shapes
 from dreamer_jax.records import Records
 from runs import random_params
 
-A, STORED, UPDATES, SEEDS = 2, 10, 100, 3
+A, STORED, UPDATES, SEEDS = 2, 10, 60, 3
 DEBUG = preset("debug")
 # Most updates here are computed, not only compiled.
 CONFIG = dataclasses.replace(
@@ -181,7 +181,7 @@ def test_no_sum_of_an_update_is_made_in_bfloat16_but_the_products_are(bfloat16_u
     )
 
 
-def test_after_100_updates_the_losses_are_those_of_float32_within_a_tenth_of_the_noise_of_seeds():
+def test_after_60_updates_the_losses_are_those_of_float32_within_a_tenth_of_the_noise_of_seeds():
     batches = stored_batches()
 
     def losses(precision, seeds):
@@ -201,10 +201,11 @@ def test_after_100_updates_the_losses_are_those_of_float32_within_a_tenth_of_the
     # Other seeds in float32 say what noise is; in bfloat16 the first one is enough.
     exact, rounded = losses("float32", SEEDS), losses("bfloat16", 1)
     for name in LOSSES:
-        first, last = (exact[name][:, part].mean() for part in (slice(10), slice(-50, None)))
-        ends = exact[name][:, -50:].mean(1)
-        difference = abs(ends[0] - rounded[name][0, -50:].mean())
-        # A hundredth at most; from a tenth on where parameters are rounded to bfloat16 too.
+        first, last = (exact[name][:, part].mean() for part in (slice(10), slice(-10, None)))
+        ends = exact[name][:, -30:].mean(1)
+        difference = abs(ends[0] - rounded[name][0, -30:].mean())
+        # A fiftieth at most for nine seeds; where parameters are rounded to bfloat16 too, a tenth
+        # and more of five losses, 1.5 of the image's.
         assert difference < 0.1 * ends.std(ddof=1), name
         if name in ("image_loss", "reward_loss", "termination_loss"):
             assert last < 0.9 * first, f"{name} was learned"
