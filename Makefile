@@ -80,7 +80,7 @@ $(VENV)/.weights: $(STAMP)bullet+brax+gymnasium+dev$(ON)
 	@$(RUN) -m pip install --quiet --disable-pip-version-check --no-deps silero-vad==6.2.3
 	@touch $@
 
-test: $(STAMP)bullet+brax+gymnasium+dev$(ON) $(VENV)/.weights  ## Run the test suite (8 to 10 minutes)
+test: $(STAMP)bullet+brax+gymnasium+dev$(ON) $(VENV)/.weights  ## Run the test suite (7 to 9 minutes)
 	$(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(STAMP)bullet+brax+gymnasium+dev$(ON)  ## Check style and types
