@@ -394,25 +394,27 @@ def test_discrete_choices_are_learned_with_their_values(tmp_path, monkeypatch):
     always = {"epsilon_start": 1.0, "epsilon_end": 1.0}
     config = learning_config(1100, prefill_phases=3, **always)
     agent, env, ticks = Agent(config, 3, discrete=True), Walk(), config.schedule.phase_ticks
-    members = (Member(0, "probe"), Member(1, "probe"))
-    run, _ = trained(tmp_path, agent=agent, env=env, members=members)
-    rows = read_metrics(tmp_path)
-    random = [row["return"] for row in rows if row.get("policy") == "random"]
-    assert np.mean(random) < 0.5 * ticks
-    # From any cell the best choices lose a tick at most. Six seeds of eight learned them.
-    scores = [row["return"] for row in rows if row["kind"] == "evaluation"]
-    assert max(scores) <= ticks
-    learned = [p for p, score in enumerate(scores) if score > 0.8 * ticks]
+    # Of eight seeds six learned it: a second one is asked if the first has not.
+    for seed in range(2):
+        folder = tmp_path / f"seed-{seed}"
+        run, _ = trained(folder, agent=agent, env=env, members=(Member(seed, "probe"),))
+        rows = read_metrics(folder)
+        random = [row["return"] for row in rows if row.get("policy") == "random"]
+        assert np.mean(random) < 0.5 * ticks
+        # From any cell the best choices lose a tick at most.
+        (score,) = (row["return"] for row in rows if row["kind"] == "evaluation")
+        assert score <= ticks
+        if learned := score > 0.8 * ticks:
+            break
     assert learned
-    observe, batches = jax.jit(agent.observe), run.replay.sample([0, 1], 10**6, 50, 8)
-    for p in learned:
-        params, batch = jax.tree.map(lambda x, p=p: np.asarray(x)[p], (run.state.params, batches))
-        posterior, _, _ = observe(params, batch, jax.random.key(0))
-        values = np.asarray(agent.value(params, posterior.features))
-        distance = np.abs(Walk.cell_of(batch.image) - Walk.middle)
-        near, one, two = (values[~batch.first & (distance == d)].mean() for d in range(3))
-        # Discount 0.5: 2, 1 and 0.5 for the best choices, less for an actor that is kept random.
-        assert 2.2 > near > 1.4 > one > near / 4 and 1.2 > one > two > -0.2
+    batch = jax.tree.map(lambda x: x[0], run.replay.sample([0], 10**6, 50, 8))
+    params = jax.tree.map(lambda x: np.asarray(x)[0], run.state.params)
+    posterior, _, _ = jax.jit(agent.observe)(params, batch, jax.random.key(0))
+    values = np.asarray(agent.value(params, posterior.features))
+    distance = np.abs(Walk.cell_of(batch.image) - Walk.middle)
+    near, one, two = (values[~batch.first & (distance == d)].mean() for d in range(3))
+    # Discount 0.5: 2, 1 and 0.5 for the best choices, less for an actor that is kept random.
+    assert 2.2 > near > 1.4 > one > near / 4 and 1.2 > one > two > -0.2
 
 
 def test_a_configuration_survives_json():
