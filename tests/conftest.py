@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,6 +25,10 @@ if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
     # In one part, since there is a core for each process of tests, and less to do in all.
     _flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join(_flags).strip()
+
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    # As in what a script starts in the background: many tests here are of Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 LONGEST = (
     "test_brax",
