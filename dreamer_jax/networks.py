@@ -118,9 +118,9 @@ class Encoder(nn.Module):
     def __call__(self, images: jax.Array) -> jax.Array:
         x = images
         for i in range(encoder_layers(self.image_size)):
-            channels = self.depth * 2**i
-            layer = Convolution(channels, 4, False, True, self.dtype, self.method, name=f"conv_{i}")
-            x = layer(x)
+            x = Convolution(
+                self.depth * 2**i, 4, dtype=self.dtype, method=self.method, name=f"conv_{i}"
+            )(x)
         return x.reshape(*x.shape[:-3], -1)
 
 

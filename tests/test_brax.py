@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from jax.extend.core import jaxprs_in_params
 
 import envs
 from compilation import QUICK_CODE
@@ -38,9 +37,11 @@ from envs.mixed import MixedEnv
 from envs.scene import Geometry, Scene
 from golden import brax_reference
 from phases import phase_of
+from pictures import psnr
 from probes import Probe
 from runs import random_members
 from small_agent import Small
+from traces import equations
 
 NAMES = [name for name in envs.task_names() if name.startswith("brax/")]
 TITLES = [envs.spec(name).title for name in NAMES]
@@ -94,6 +95,7 @@ for stream in (sys.stdout, sys.stderr):
 
 import hashlib, jax
 from phases import phase_of
+from pictures import psnr
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 env = envs.make([{SWINGUP!r}], members=2, image_size=16)
@@ -130,12 +132,6 @@ def fresh(env, tmp_path_factory) -> Fresh:
     )
     lines = process.stdout.splitlines(), process.stderr.splitlines()
     return Fresh(process.returncode, *lines, list(folder.iterdir()))
-
-
-def psnr(one, other) -> np.ndarray:
-    """Peak signal-to-noise ratio of pictures [..., height, width, 3] in decibel."""
-    error = np.square(np.asarray(one, np.float64) - np.asarray(other)).mean((-3, -2, -1))
-    return 10 * np.log10(255**2 / np.maximum(error, 1e-9))
 
 
 def same(one, two) -> bool:
@@ -576,17 +572,9 @@ def programs(brax_pixels):
     }  # fmt: skip
 
 
-def primitives(jaxpr):
-    """The names of all that a traced program does, in the programs within it too."""
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for within in jaxprs_in_params(equation.params):
-            yield from primitives(within)
-
-
 @pytest.mark.parametrize("name", ["round", "collect", "update", "diagnose"])
 def test_no_program_of_a_run_calls_the_host(programs, name):
-    found = list(primitives(programs[name].jaxpr.jaxpr))
+    found = [x.primitive.name for x in equations(programs[name].jaxpr.jaxpr)]
     assert not [name for name in found if "callback" in name] and len(found) > 100
 
 

@@ -14,6 +14,7 @@ from dreamer_jax.diagnosis import diagnose
 from dreamer_jax.population import batch_shapes
 from dreamer_jax.records import Records
 from runs import random_params
+from traces import equations
 
 A, STORED, UPDATES, SEEDS = 2, 10, 60, 3
 DEBUG = preset("debug")
@@ -63,16 +64,6 @@ def bfloat16_update():
     state = jax.eval_shape(agent.init, 0)
     traced, out = jax.make_jaxpr(agent.update, return_shape=True)(state, batch_shapes(agent, B, L))
     return traced.jaxpr, state, out
-
-
-def equations(jaxpr):
-    """All equations of a traced program, those of inner programs too."""
-    for equation in jaxpr.eqns:
-        yield equation
-        for parameter in jax.tree.leaves(list(equation.params.values())):
-            inner = getattr(parameter, "jaxpr", parameter)
-            if hasattr(inner, "eqns"):
-                yield from equations(inner)
 
 
 def dtypes(tree):

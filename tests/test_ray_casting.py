@@ -15,6 +15,7 @@ import envs
 from envs import SimulatorError
 from envs.ray_casting import render
 from envs.scene import Camera, Checker, Geometry, Light, Scene, scene_of
+from pictures import psnr
 
 DAYLIGHT = Light("head", diffuse=(0.0,) * 3, ambient=(1.0,) * 3)
 TITLES = [envs.spec(name).title for name in envs.task_names() if name.startswith("brax/")]
@@ -89,12 +90,6 @@ def everything(mujoco, repeat="3 3", uniform="false", size="3 2 1"):
 
 def poses(data):
     return np.asarray(data.xpos[1:], np.float32), np.asarray(data.xquat[1:], np.float32)
-
-
-def psnr(one, other) -> np.ndarray:
-    """Peak signal-to-noise ratio of pictures [..., height, width, 3] in decibel."""
-    error = np.square(np.asarray(one, np.float64) - other).mean((-3, -2, -1))
-    return 10 * np.log10(255**2 / np.maximum(error, 1e-9))
 
 
 def ball(**camera) -> Scene:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sklearn.neighbors import KNeighborsClassifier
 
+from traces import equations
 from transfer.ltc import NOVEL, accuracy, classify, fit, nearest, suggest_threshold, vote
 from transfer.recipes import latent_task_thresholds
 
@@ -95,21 +96,11 @@ def test_classification_is_the_same_in_chunks_of_any_size(monkeypatch):
             np.testing.assert_array_equal(a, b)
 
 
-def sizes(jaxpr):
-    """The sizes of all arrays that a traced program makes, in its loops too."""
-    for equation in jaxpr.eqns:
-        yield from (variable.aval.size for variable in equation.outvars)
-        for parameter in jax.tree.leaves(equation.params):
-            inner = getattr(parameter, "jaxpr", parameter)
-            if hasattr(inner, "eqns"):
-                yield from sizes(inner)
-
-
 def test_no_array_of_all_queries_times_all_samples_times_all_features_is_made():
     samples, queries, features = 400, 8000, 230
     model = fit(np.zeros((samples, features)), np.zeros(samples, int))
     traced = jax.make_jaxpr(nearest)(model, jnp.zeros((queries, features)))
-    largest = max(sizes(traced.jaxpr))
+    largest = max(made.aval.size for x in equations(traced.jaxpr) for made in x.outvars)
     assert samples * features <= largest <= 2**22 < samples * queries * features
 
 
